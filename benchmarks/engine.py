@@ -36,7 +36,7 @@ from jast.rewards import as_pytree
 from jast.search.forest import MODES
 from jast.search.tree import run
 from jast.search.tree.layout import choose_rollout, take
-from jast.search.tree.settings import problem_of, settled
+from jast.search.tree.settings import mode_settings, problem_of
 from jast.simulator import Simulator
 
 REWARD = jast.rewards.standard(event_bonus=30.0, density="mode")
@@ -46,7 +46,7 @@ BOX = jast.actions.uniform(0.0, 1.0)
 def problem(total, mode="paper", sim=None, reward=REWARD, actions=BOX):
     """What `jast.search.forest` grows in this mode."""
     sim = jast.simulators.ferry() if sim is None else sim
-    chosen = settled("forest", MODES, mode, actions)
+    chosen = mode_settings("forest", MODES, mode, actions)
     return problem_of(sim, as_pytree(reward), actions, chosen, 10.0, total)
 
 
@@ -180,7 +180,7 @@ def compile_time(total=9000, lanes=100):
         nonlocal start
         out[name], start = time.perf_counter() - start, time.perf_counter()
 
-    tree = jax.eval_shape(lambda: run.make(p, run._shared(p), keys, total, "node"))
+    tree = jax.eval_shape(lambda: run.make(p, keys, total, "node"))
     lap("trace of the arrays")
     run._grow.lower(p, tree, 0, 500, "node").compile()
     lap("grow")

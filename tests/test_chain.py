@@ -16,8 +16,9 @@ import jast
 from benchmarks import stress_systems
 from jast import limit_state, rewards
 from jast.distributions import Normal, seeds
-from jast.search import kept as K
+from jast.search import tempering
 from jast.search.chain import chain
+from jast.search.kept import BestEpisodes, standard_reward
 
 module = importlib.import_module("jast.search.chain")
 SMALL = dict(episodes=3000, refine=0)
@@ -30,18 +31,21 @@ def test_every_width_has_its_distribution(key):
     decides. The walk fails at any of several steps, so exchanges change how many numbers count.
     """
     sim = walk()
-    search = module._Search(key, sim, (4, 16), 0.9)
-    kept, d = K.none(sim, 64), limit_state.dimension(sim)
-    looks = [(2.0, _drawn(key, sim, 2.0, 64))]
-    chains, widths = search._begun(looks)
-    assert widths[0] == 2 and np.isclose(widths[-1], 0.9)
+    search = module._Search(key, sim, 10_000, 0.9, 64)
+    search.levels, search.chains = 4, 16
+    best, d = BestEpisodes.none(sim, 64), limit_state.dimension(sim)
+    nothing = tempering.no_points(64, d, np.float32)
+    draws = nothing, nothing, nothing, tempering.Points(*_drawn(key, sim, 3.0, 64))
+    chains, widths = search.first_chains(draws)
+    assert widths[0] == 3 and np.isclose(widths[-1], 0.9)
     seen = []
     for i in range(600):
         ends = jnp.int32(64 * 4 * i), jnp.int32(64 * 4 * (i + 1))
-        args = search.key, sim, search.reward, kept, chains, widths, *ends
-        (kept, chains), _ = module.T.walk(*args)
+        args = search.key, sim, search.reward, best, chains, widths, *ends
+        (best, chains), _ = tempering.move_chains(*args)
         if i >= 100:
-            seen.append(_numbers(np.asarray(chains.z), np.asarray(chains.used), d))
+            points = jax.device_get(chains.points)
+            seen.append(_numbers(points.z, points.used, d))
     assert (chains.swapped > 0.1).all()
     seen = np.stack(seen)  # [snapshots, 3, levels, chains]
     for level, width in enumerate(np.asarray(widths)):
@@ -82,7 +86,7 @@ def test_kinds_of_disturbances(key, equal, make):
     """Whole numbers and random starts."""
     sim = make()
     r = chain(key, sim, **SMALL)
-    assert r.failing_per_tree.all() and archive_replays(sim, r, K.likelihood(sim), equal)
+    assert r.failing_per_tree.all() and archive_replays(sim, r, standard_reward(sim), equal)
 
 
 def far(limit, distance):

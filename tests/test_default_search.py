@@ -15,7 +15,7 @@ import jast
 from jast import actions, rewards
 from jast import distributions as D
 from jast.search import cem, forest, mcts, monte_carlo
-from jast.search.pilot import fly
+from jast.search.pilot import calibrate
 
 SEARCHES = {
     "cem": lambda key, sim, **of: cem(key, sim, samples=100, elites=10, iterations=8, **of),
@@ -148,7 +148,7 @@ def test_the_scales_are_the_systems_own(key, name, equal):
     told = search(key, sim, reward=reward_of(a), actions=_said(a), top=1000)
     bare = search(key, sim, top=1000)
     widen = {"cem": "blind", "monte_carlo": "never"}.get(name, "always")
-    own = fly(sim, "mode", widen).tally
+    own = calibrate(sim, "mode", widen).tally
     if name == "monte_carlo":
         assert bare.episodes == told.episodes == 600
         return
@@ -204,10 +204,10 @@ def test_scales_of_systems_that_say_little():
         lambda s: (s > 1, jnp.zeros(())),
         2,
     )
-    found = fly(zero(0), "mode", "never")
+    found = calibrate(zero(0), "mode", "never")
     assert (found.near, found.rare, found.likely) == (1, 1, 0)
     broken = walk(step=lambda s, x: s + jnp.nan)
-    found = fly(broken, "mode", "always")
+    found = calibrate(broken, "mode", "always")
     assert np.isfinite([found.near, found.rare, found.likely, found.width]).all()
     assert found.tally.invalid == found.tally.episodes
 

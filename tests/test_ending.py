@@ -101,10 +101,12 @@ def test_where_it_is_off(key):
     assert few.refined is None
     assert few.episodes * 0.05 < 100
     relative, raw = (rewards.lexicographic(1.0, 5.0, density=d) for d in ("mode", "raw"))
-    assert ending.usual(SIM, relative) == 0.1 == ending.planned("", None, SIM, {}, 0.1)["refine"]
-    assert ending.usual(SIM, raw) == 0 == ending.usual(SIM, rewards.STANDARD)
-    assert ending.planned("", None, dice(), {}, 0.1)["refine"] == 0
-    assert ending.planned("", None, SIM, None, 0.1) is None
+    assert ending.default_share(SIM, relative) == 0.1
+    assert ending.default_share(SIM, raw) == 0 == ending.default_share(SIM, rewards.STANDARD)
+    share_of = ending.with_refine_share
+    assert share_of("", None, SIM, {}, 0.1)["refine"] == 0.1
+    assert share_of("", None, dice(), {}, 0.1)["refine"] == 0
+    assert share_of("", None, SIM, None, 0.1) is None
     traced = jax.jit(lambda key: monte_carlo(key, SIM, episodes=2000))(key)
     assert traced.refined is None and traced.failing > 0
 
@@ -168,7 +170,7 @@ def test_an_interruption_leaves_what_was_found(key, monkeypatch):
         raise KeyboardInterrupt
 
     search = SEARCHES["cem"]
-    monkeypatch.setattr(ending, "pull", interrupted)
+    monkeypatch.setattr(ending, "refine", interrupted)
     found = search(key, SIM)
     assert found.refined is None and found.failures.size == 64
     assert found.settings["interrupted"] == f"while refining, after all {found.episodes} episodes"

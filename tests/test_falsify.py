@@ -79,9 +79,9 @@ def test_one_at_a_time_on_a_black_box(key):
 def test_what_came_after_an_episodes_end_is_left_as_it_is():
     module = importlib.import_module("jast.search.falsify")
     rows = np.random.default_rng(0).uniform(size=(1, 8, 2))
-    pool = module._Pool(np.ones(1), rows, np.zeros((1, 0)), np.array([3]))
+    pool = module.Pool(np.ones(1), rows, np.zeros((1, 0)), np.array([3]))
     rng = np.random.default_rng(1)
-    children = np.stack([module._signal(rng, pool, 99, (8, 2), 0)[0] for _ in range(200)])
+    children = np.stack([module.signal(rng, pool, 99)[0] for _ in range(200)])
     assert (children[:, 3:] == rows[0, 3:]).mean() == 1
     assert ((children[:, :3] != rows[0, :3]).any(axis=(0, 2))).all()
 
@@ -95,7 +95,7 @@ def test_none_is_found_where_there_is_none(key):
     assert float(found.best.distance) == pytest.approx(-found.history.best_reward[-1, 0])
 
 
-def test_bad_input_and_interrupts(key):
+def test_bad_input_and_interrupts(key, monkeypatch):
     with pytest.raises(ValueError, match="falsify: batch"):
         falsify(key, held(), batch=0)
     seeds = held(disturbance=lambda s: jast.distributions.seeds(), step=lambda s, x: s)
@@ -111,3 +111,7 @@ def test_bad_input_and_interrupts(key):
 
     found = falsify(key, held(), simulations=100, stop=False, callback=stop)
     assert found.episodes == 20 and found.settings["interrupted"] == "after 20 of 100 episodes"
+    module = importlib.import_module("jast.search.falsify")
+    monkeypatch.setattr(module, "signal", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
+    with pytest.raises(KeyboardInterrupt):  # nothing is there yet
+        falsify(key, held())

@@ -2,7 +2,6 @@
 steps alone.
 """
 
-import importlib
 import re
 
 import jax
@@ -16,11 +15,14 @@ from trees import large_copies
 import jast
 from benchmarks import stress_systems
 from jast import rewards
+from jast.counter import tree_keys
 from jast.distributions import Normal, seeds
+from jast.search.cells import empty_cells, features
 from jast.search.go_explore import go_explore
+from jast.search.kept import BestEpisodes, standard_reward
 from jast.search.monte_carlo import monte_carlo
+from jast.search.phases import Plan, explore
 
-module = importlib.import_module("jast.search.go_explore")
 RELATIVE = rewards.standard(density="mode")
 
 
@@ -84,7 +86,7 @@ def test_kinds_of_disturbances(key, equal, make):
     """Whole-numbered disturbances, random starts, episodic systems."""
     sim = make()
     r = go_explore(key, sim, episodes=4000, refine=0)
-    assert r.failing_per_tree.all() and archive_replays(sim, r, module.K.likelihood(sim), equal)
+    assert r.failing_per_tree.all() and archive_replays(sim, r, standard_reward(sim), equal)
 
 
 @pytest.mark.long
@@ -193,11 +195,11 @@ def test_a_black_box(key, equal):
 def test_the_archive_is_not_copied(key):
     """Within the loop: the disturbances of all slots, the largest array, are written in place."""
     sim = climb(200)
-    search = module._Search(key, sim, None, module.P.Plan(64, 4, 4), 10_000, 5000)
-    mark = jax.eval_shape(lambda: module.C.features(sim, jnp.int32(0)))
-    cells, kept = module.C.empty(sim, 2048), module.K.none(sim, 64, mark)
-    args = search.key, sim, search.reward, None, search.plan, cells, kept
-    text = module.P.explore.lower(*args, jnp.int32(0), jnp.int32(64)).compile().as_text()
+    plan = Plan(lanes=64, length=4, traces=4)
+    mark = jax.eval_shape(lambda: features(sim, jnp.int32(0)))
+    archives = empty_cells(sim, 2048), BestEpisodes.none(sim, 64, mark)
+    args = tree_keys(key, 1)[0], sim, standard_reward(sim), None, plan, *archives
+    text = explore.lower(*args, jnp.int32(0), jnp.int32(64)).compile().as_text()
     assert "[2048,200]" in text and not large_copies(text, 2048 * 200)
 
 

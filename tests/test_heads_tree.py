@@ -451,9 +451,7 @@ def test_children_that_wait_need_more_pages():
 )
 def test_no_array_of_the_tree_is_copied_in_a_loop(name, candidates, memoize):
     p = searching(name, candidates)
-    make = lambda: T.make(
-        p, run._shared(p), tree_keys(jax.random.key(0), 3), 180, memoize, T.pages_of(p, 180)
-    )
+    make = lambda: T.make(p, tree_keys(jax.random.key(0), 3), 180, memoize, T.pages_of(p, 180))
     text = run._grow.lower(p, jax.eval_shape(make), 0, 60, memoize).compile().as_text()
     assert not large_copies(text, 180)
 

@@ -121,7 +121,7 @@ def test_what_is_free(monkeypatch, tmp_path):
 def test_what_is_not_known_hinders_nothing(monkeypatch):
     monkeypatch.setattr(memory, "available", lambda: None)
     memory.require("function", 2**80, "arrays", "use fewer")
-    of_trees.keep("forest", fresh(), 2**60, True)
+    of_trees.require_rewards("forest", fresh(), 2**60, True)
 
 
 def test_bytes_for_people():

@@ -14,7 +14,7 @@ from systems import S0, mark_long, ring, two_densities, walk
 import jast
 from jast import actions, rewards
 from jast.distributions import Categorical, seeds
-from jast.search import lockstep as E
+from jast.search.lockstep import distinct_episodes
 from jast.search.monte_carlo import monte_carlo
 
 # the package has the function by that name
@@ -227,8 +227,6 @@ def test_interruption_and_callback(key, equal, monkeypatch):
     assert r.settings["interrupted"] == "after 256 of 1000 episodes"
     assert "interrupted: after 256" in str(r)
     equal(r.failures, monte_carlo(key, walk(), episodes=256).failures)
-    with pytest.raises(KeyboardInterrupt):
-        E.drive(lambda *_: (_ for _ in ()).throw(KeyboardInterrupt), None, [10])
 
 
 def test_progress_bar(key, capsys):
@@ -271,7 +269,7 @@ def test_best_distinct_episodes():
     tag = jnp.array([0, 7, 7, 0, 0, 8, 0, 0], jnp.uint32)
     failure = jnp.array([1, 1, 1, 1, 1, 1, 1, 0], bool)
     number = jnp.array([0, 12, 11, 13, 14, 15, 16, 17], jnp.int32)
-    places, counts = E.distinct(failure, reward, tag, number, jnp.ones(8, jnp.int32), 7)
+    places, counts = distinct_episodes(failure, reward, tag, number, jnp.ones(8, jnp.int32), 7)
     assert places.tolist() == [2, 5, 4, 0, 7, 8, 8] and counts.tolist() == [2, 1, 1, 1, 1, 0, 0]
 
 

@@ -314,9 +314,7 @@ def test_a_record_of_nothing_is_empty():
 def compiled_text(sim, simulations, memoize, record=False, **choices):
     p = problem(sim, simulations, **choices)
     keys = tree_keys(jax.random.key(0), 2)
-    tree = jax.eval_shape(
-        lambda: T.make(p, run._shared(p), keys, simulations, memoize, record=record)
-    )
+    tree = jax.eval_shape(lambda: T.make(p, keys, simulations, memoize, record=record))
     return run._grow.lower(p, tree, 0, 100, memoize).compile().as_text()
 
 

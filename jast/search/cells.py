@@ -17,50 +17,48 @@ from jax import lax
 
 from jast.outline import outline
 from jast.rewards import log_likelihood
-from jast.search import lockstep as E
-from jast.search import restarts as R
+from jast.search.lockstep import EMPTY_HASH, blank_episodes, fold_hash
+from jast.search.restarts import Point, start_point
 from jast.simulator import Simulator, ravel
 
-__all__ = ["Cells", "chosen", "empty", "features", "merged"]
+__all__ = ["Cells", "choose_cells", "empty_cells", "features", "merge_cells"]
 
-PHASES, HALVES, SIDES = 16, 12, 3
-"""Cells: stretches of the horizon, halvings of the rank, cells to each side of a projection."""
+PHASES = 16
+"""Stretches of the horizon that cells tell apart."""
+HALVES = 12
+"""Halvings of the rank of the miss distance: the nearest of 4096 states are told apart."""
+SIDES = 3
+"""Cells to each side of the mean of a projection, half a standard deviation each."""
 
 
 class Cells(NamedTuple):
     """S slots."""
 
-    points: R.Point
+    points: Point
     x0: Any
     rows: Any
     """[S, horizon, ...]: the disturbances up to the point count."""
-    near: Any
+    near: jax.Array
     """[S] the state's own miss distance; inf where there is none."""
-    seen: Any
+    seen: jax.Array
     """[S] int32: how many runs went on from the cell."""
-    live: Any
+    live: jax.Array
     """[S] bool: the slot holds a state."""
 
 
 @partial(jax.jit, static_argnums=1)
-def empty(sim: Simulator, slots: int) -> Cells:
+def empty_cells(sim: Simulator, slots: int) -> Cells:
     """No state yet."""
-    about = outline(sim)
-    zero = lambda s: jnp.zeros((slots, *s.shape), s.dtype)
-    long = lambda s: jnp.zeros((slots, sim.horizon, *s.shape), s.dtype)
-    point = jax.eval_shape(lambda: R.started(sim, log_likelihood, jax.tree.map(_blank, about.x0)))
+    e, none = blank_episodes(sim, slots), jnp.zeros(slots, jnp.int32)
+    point = jax.eval_shape(partial(start_point, sim, log_likelihood), outline(sim).x0)
     return Cells(
-        jax.tree.map(zero, point),
-        jax.tree.map(zero, about.x0),
-        jax.tree.map(long, about.x),
-        jnp.full(slots, jnp.inf, about.dtype),
-        jnp.zeros(slots, jnp.int32),
-        jnp.zeros(slots, bool),
+        points=jax.tree.map(lambda s: jnp.zeros((slots, *s.shape), s.dtype), point),
+        x0=e.x0,
+        rows=e.disturbances,
+        near=e.distance,
+        seen=none,
+        live=none > 0,
     )
-
-
-def _blank(s):
-    return jnp.zeros(s.shape, s.dtype)
 
 
 def features(sim: Simulator, state: Any) -> jax.Array:
@@ -71,7 +69,7 @@ def features(sim: Simulator, state: Any) -> jax.Array:
     return jnp.clip(jnp.nan_to_num(row, nan=0.0), -1e6, 1e6)
 
 
-def chosen(cells: Cells, coin: jax.Array, u: jax.Array, nearest: Any) -> jax.Array:
+def choose_cells(cells: Cells, coin: jax.Array, u: jax.Array, nearest: Any) -> jax.Array:
     """The slot [N] of each lane by uniform numbers ``coin`` and ``u`` [N]: with probability
     ``nearest`` those that are nearest to failure first, else those least gone on from.
     """
@@ -79,19 +77,23 @@ def chosen(cells: Cells, coin: jax.Array, u: jax.Array, nearest: Any) -> jax.Arr
     near = jnp.where(cells.live & jnp.isfinite(cells.near), cells.near, jnp.inf)
     rank = jnp.searchsorted(jnp.sort(near), near, side="right").astype(u.dtype)
     seen = 1 / (1 + cells.seen.astype(u.dtype))
-    by = lambda weight, u: jnp.searchsorted(s := jnp.cumsum(weight), u * s[-1], side="right")
-    pick = jnp.where(
-        coin < nearest, by(live * jnp.sqrt(seen) / jnp.maximum(rank, 1), u), by(live * seen, u)
-    )
+    near_first = _drawn(live * jnp.sqrt(seen) / jnp.maximum(rank, 1), u)
+    pick = jnp.where(coin < nearest, near_first, _drawn(live * seen, u))
     return jnp.minimum(pick, live.shape[0] - 1).astype(jnp.int32)
 
 
-def merged(
+def _drawn(weight, u):
+    """Numbers with probabilities proportional to ``weight``, by the uniform numbers ``u``."""
+    total = jnp.cumsum(weight)
+    return jnp.searchsorted(total, u * total[-1], side="right")
+
+
+def merge_cells(
     sim: Simulator,
     cell: Callable | None,
     key: jax.Array,
     cells: Cells,
-    points: R.Point,
+    points: Point,
     good: Any,
     lane: Any,
     ways: tuple[Any, Any],
@@ -118,7 +120,10 @@ def merged(
         near = jax.vmap(lambda s: jnp.asarray(sim.evaluate(s)[1]).astype(real))(
             points.progress.state
         )
-    both = lambda a, b: jnp.concatenate([a, b])
+
+    def both(a, b):
+        return jnp.concatenate([a, b])
+
     value = both(cells.points.progress.reward, points.progress.reward)
     live = both(cells.live, good) & jnp.isfinite(value)
     parts = cells.points.progress.state, points.progress.state
@@ -127,7 +132,9 @@ def merged(
         t = both(cells.points.t, points.t)
         name = _by_default(sim, key, told, t, both(cells.near, near), live, cells)
     else:
-        name = both(*(jax.vmap(lambda s: E.fold(jnp.uint32(E.FIRST), cell(s)))(s) for s in parts))
+        name = both(
+            *(jax.vmap(lambda s: fold_hash(jnp.uint32(EMPTY_HASH), cell(s)))(s) for s in parts)
+        )
     # the likeliest way to each cell
     out = jnp.where(live, 0, 1)
     index = jnp.arange(live.shape[0], dtype=jnp.int32)
@@ -151,14 +158,17 @@ def merged(
     places, free = places[:most], free[:most]
     enters = new[places] & (~old[free] | (seen[:slots][free] > 0))
     to = jnp.where(enters, free, slots)
-    put = lambda into, a, at: jax.tree.map(lambda s, v: s.at[to].set(v[at], mode="drop"), into, a)
+
+    def put(into, a, at):
+        return jax.tree.map(lambda s, v: s.at[to].set(v[at], mode="drop"), into, a)
+
     return Cells(
-        put(cells.points, points, places),
-        put(cells.x0, ways[0], lane[places]),
-        put(cells.rows, ways[1], lane[places]),
-        put(cells.near, near, places),
-        put(seen[:slots], seen[slots:], places),
-        put(old, new, places),
+        points=put(cells.points, points, places),
+        x0=put(cells.x0, ways[0], lane[places]),
+        rows=put(cells.rows, ways[1], lane[places]),
+        near=put(cells.near, near, places),
+        seen=put(seen[:slots], seen[slots:], places),
+        live=put(old, new, places),
     )
 
 

@@ -9,6 +9,7 @@ all iterations.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -19,37 +20,36 @@ from jax import lax
 from jast import _checks, units
 from jast import actions as choices
 from jast._jax import jit
-from jast.checkpoints import keep_answers, open_checkpoint
 from jast.counter import tree_keys
 from jast.cross_entropy import sequences
 from jast.episode import Episode
-from jast.incidents import incidents, new_incidents, runs_on_host
+from jast.incidents import incidents
 from jast.memory import require_episodes
 from jast.outline import outline
-from jast.search import lockstep as E
-from jast.search import proposals as P
-from jast.search.ending import ended, planned, usual
-from jast.search.pilot import joined
+from jast.search.driver import Log, finish, finish_traced, require_counts, run
+from jast.search.ending import default_share, with_refine_share
+from jast.search.lockstep import Tally, blank_episodes, distinct_episodes, play_lanes
+from jast.search.pilot import with_calibration
 from jast.search.prepare import default_actions, prepare
-from jast.simulator import require_simulator
+from jast.search.proposals import copy_steps, latents_around, make_draw, proposal_kinds
+from jast.search.result import SearchResult, Trials
+from jast.simulator import Simulator, require_simulator
 
 if TYPE_CHECKING:
     import chex
 
     from jast.failures import Failures
-    from jast.search.result import SearchResult
-    from jast.simulator import Simulator
     from jast.typing import Actions, Callback, PathLike, Reward
 
 __all__ = ["cem"]
 
 
-class Settings(NamedTuple):
+class Shares(NamedTuple):
     """The real-valued settings, all traced."""
 
-    smoothing: Any
-    floor: Any
-    fresh: Any
+    smoothing: jax.Array | float
+    floor: jax.Array | float
+    fresh: jax.Array | float
 
 
 class Plan(NamedTuple):
@@ -58,19 +58,27 @@ class Plan(NamedTuple):
     samples: int
     elites: int
     kinds: tuple[str, str]
-    """Of x0 and x (`P.kinds`)."""
+    """Of x0 and x (`proposal_kinds`)."""
 
 
-class Pool(NamedTuple):
+class Elites(NamedTuple):
     """The K best distinct episodes of a tree so far, best first: the elites, and the archive."""
 
     episode: Episode
     """[K]; reward -inf where there are fewer."""
     latent: Any
     """z of (x0, x): leaves [K, 1, ...] and [K, horizon, ...]; ``()`` where they are copied."""
-    tag: Any
-    number: Any
-    count: Any
+    tag: jax.Array
+    number: jax.Array
+    count: jax.Array
+
+
+class State(NamedTuple):
+    """A search so far, of every tree."""
+
+    elites: Elites
+    proposals: tuple[Any, Any]
+    """Of x0 and x: `jast.cross_entropy.sequences.Steps`; ``()`` where they are copied."""
 
 
 def cem(
@@ -156,145 +164,159 @@ def cem(
         >>> bool(result.best.failure)
         True
     """
-    samples, elites, iterations, trees, top = E.whole(
-        "cem", samples=samples, elites=elites, iterations=iterations, trees=trees, top=top
-    )
+    name = "cem"
+    counts = dict(samples=samples, elites=elites, iterations=iterations, trees=trees)
+    samples, elites, iterations, trees, top = require_counts(name, **counts, top=top)
     if elites > samples:
-        raise ValueError(f"cem: elites must be at most samples, {samples}, received {elites}")
+        raise ValueError(f"{name}: elites must be at most samples, {samples}, received {elites}")
     if samples * iterations * trees >= 2**31:
         raise ValueError(
-            f"cem: samples x iterations x trees must be below 2^31, received {samples} x"
+            f"{name}: samples x iterations x trees must be below 2^31, received {samples} x"
             f" {iterations} x {trees}"
         )
-    share = lambda name, value: _checks.real_number(
-        "cem", name, value, lambda v: 0 <= v <= 1, "from 0 to 1"
+    require_simulator(name, sim)
+    require_episodes(name, sim, samples * trees)
+    shares = dict(smoothing=smoothing, floor=floor, fresh=fresh)
+    for setting, value in shares.items():
+        shares[setting] = _checks.real_number(
+            name, setting, value, lambda v: 0 <= v <= 1, "from 0 to 1"
+        )
+    actions, before = default_actions(name, sim) if actions is None else actions, incidents(sim)
+    reward, actions, settings, calibration = prepare(
+        name, key, sim, reward, actions, widen="blind", **counts, **shares
     )
-    require_simulator("cem", sim)
-    require_episodes("cem", sim, samples * trees)
-    real = Settings(share("smoothing", smoothing), share("floor", floor), share("fresh", fresh))
-    actions = default_actions("cem", sim) if actions is None else actions
-    before = incidents(sim)
-    counts = dict(samples=samples, elites=elites, iterations=iterations, trees=trees)
-    reward, actions, settings, pilot = prepare(
-        "cem", key, sim, reward, actions, widen="blind", **counts, **real._asdict()
+    settings = with_refine_share(name, refine, sim, settings, default_share(sim, reward))
+    around = () if failures is None else latents_around(sim, actions, failures, settings)
+    search = _Search(
+        sim=sim,
+        reward=reward,
+        top=top,
+        keys=tree_keys(key, trees),
+        actions=actions,
+        shares=Shares(**shares),
+        plan=Plan(samples, elites, proposal_kinds(sim, actions)),
+        around=around,
+        record=bool(record),
     )
-    settings = planned("cem", refine, sim, settings, usual(sim, reward))
-    plan = Plan(samples, elites, P.kinds(sim, actions))
-    around = () if failures is None else P.around(sim, actions, failures, settings)
-    asked = counts | dict(sim=sim, reward=reward, actions=actions, real=real, around=around)
-    asked |= dict(top=top, record=bool(record))
-    search = partial(_iteration, tree_keys(key, trees), sim, reward, actions, real, plan)
-    width = actions.width if isinstance(actions, choices.Wide) else 1.0
-    carry = _nothing(sim, plan, trees, max(elites, top), width, around)
+    ends = [samples * (i + 1) for i in range(iterations)]
     if settings is None:
-        units.require_untraced("cem", checkpoint=checkpoint)
+        units.require_untraced(name, checkpoint=checkpoint)
+        found = search.traced(iterations)
+        return with_calibration(sim, reward, calibration, found, top)
+    return run(
+        key,
+        search,
+        ends,
+        settings,
+        trees=trees,
+        record=search.record,
+        calibration=calibration,
+        before=before,
+        progress=progress,
+        callback=callback,
+        checkpoint=checkpoint,
+        reward=reward,
+        actions=actions,
+        around=around,
+    )
+
+
+@dataclass(frozen=True)
+class _Search:
+    """A `jast.search.driver.Search`."""
+
+    sim: Simulator
+    reward: Any
+    top: int
+    keys: jax.Array
+    """[trees]"""
+    actions: Any
+    shares: Shares
+    plan: Plan
+    around: Any
+    record: bool
+
+    def init(self) -> State:
+        wide = isinstance(self.actions, choices.Wide)
+        width = self.actions.width if wide else 1.0
+        size = max(self.plan.elites, self.top)
+        return _first_state(self.sim, self.plan, len(self.keys), size, width, self.around)
+
+    def step(
+        self, state: State, begin: int, end: int
+    ) -> tuple[State, Tally, jax.Array, Trials | None]:
+        """One iteration of all trees."""
+        parts = self.keys, self.sim, self.reward, self.actions, self.shares, self.plan
+        state, tally, trials = _iteration(*parts, state, begin)
+        best = state.elites.episode.reward[:, 0]
+        return state, tally, best, jax.tree.map(jnp.transpose, trials) if self.record else None
+
+    def result(self, state: State, log: Log, settings: dict[str, Any]) -> SearchResult:
+        found, tree, number, count = jax.device_get(_best_failures(state.elites, self.top))
+        n = int((found.reward > -jnp.inf).sum())
+        found, tree, number, count = jax.tree.map(lambda a: a[:n], (found, tree, number, count))
+        best = _best_episode(state.elites)
+        return finish(self, log, best, found, number, counts=count, settings=settings, trees=tree)
+
+    def traced(self, iterations: int) -> SearchResult:
+        """The `SearchResult` inside a transformation."""
 
         def body(i, carry):
-            inner, counted = carry
-            inner, more, *_ = search(inner, i * samples)
-            return inner, E.add(counted, more)
+            state, tally = carry
+            state, more, *_ = self.step(state, i * self.plan.samples, None)
+            return state, tally.add(more)
 
-        (pool, _), counted = lax.fori_loop(0, iterations, body, (carry, E.nothing(trees)))
-        best = pool.episode.reward[:, 0]
-        found = E.finish_traced(sim, reward, counted, _best(pool), best)
-        return joined(sim, reward, pilot, found, top)
-
-    def chunk(carry, begin, end):
-        carry, counted, best, rows = search(carry, begin)
-        return carry, counted, best, jax.tree.map(jnp.transpose, rows) if record else None
-
-    ends = [samples * (i + 1) for i in range(iterations)]
-    with open_checkpoint("cem", checkpoint, key, **asked) as store, keep_answers(store):
-        (pool, _), log = E.drive(
-            chunk,
-            carry,
-            ends,
-            host=runs_on_host(sim),
-            trees=trees,
-            progress=progress,
-            callback=callback,
-            name="cem",
-        )
-    found, tree, number, count = jax.device_get(_archive(pool, top))
-    n = int((found.reward > -jnp.inf).sum())
-    found = E.finish(
-        sim,
-        reward,
-        log,
-        _best(pool),
-        jax.tree.map(lambda a: a[:n], found),
-        tree[:n],
-        number[:n],
-        count[:n],
-        settings,
-        top,
-    )
-    found = ended(key, sim, reward, joined(sim, reward, pilot, found, top), top)
-    return found._replace(incidents=new_incidents(before, incidents(sim)))
+        start = self.init(), Tally.none(len(self.keys))
+        state, tally = lax.fori_loop(0, iterations, body, start)
+        best, rewards = _best_episode(state.elites), state.elites.episode.reward[:, 0]
+        return finish_traced(self.sim, self.reward, tally, best, rewards)
 
 
 @partial(jit, static_argnums=5)
-def _iteration(keys, sim, reward, actions, real, plan, carry, begin):
-    """One iteration of all trees, from episode number ``begin`` on: ((`Pool`, proposals of x0 and
-    x), `E.Tally`, best reward [trees], `Trials`).
+def _iteration(keys, sim, reward, actions, shares, plan, state, begin):
+    """One iteration of all trees, from episode number ``begin`` on: (`State`, `Tally`,
+    `Trials`).
     """
-    pool, proposals = carry
     (trees,), samples = keys.shape, plan.samples
     number = begin + jnp.arange(samples, dtype=jnp.int32)
     keys = jax.vmap(lambda k: jax.vmap(partial(jax.random.fold_in, k))(number))(keys)
-    rows = jax.vmap(lambda k, p, g: _propose(k, sim, real, plan, p, g))(keys, pool, proposals)
+    rows = jax.vmap(lambda k, s: _propose(k, sim, shares, plan, s))(keys, state)
 
-    flat = lambda a: a.reshape(trees * samples, *a.shape[2:])
-    apart = lambda a: a.reshape(trees, samples, *a.shape[1:])
-    draws = (
-        P.drawer(kind, a, f)
-        for kind, a, f in zip(
-            plan.kinds,
-            (choices.quantiles(), actions),
-            (actions.draw_start, actions.draw),
-            strict=True,
-        )
-    )
+    def flat(a):
+        return a.reshape(trees * samples, *a.shape[2:])
+
+    def by_tree(tree):
+        return jax.tree.map(lambda a: a.reshape(trees, samples, *a.shape[1:]), tree)
+
+    of_start = make_draw(plan.kinds[0], choices.quantiles(), actions.draw_start)
+    of_step = make_draw(plan.kinds[1], actions, actions.draw)
     live = jnp.ones((trees * samples,), bool)
-    played = E.play(
-        sim,
-        reward,
-        flat(keys),
-        *draws,
-        live,
-        jax.tree.map(lambda a: jnp.moveaxis(flat(a), 1, 0), rows),
-        record=True,
-    )
+    level_first = jax.tree.map(lambda a: jnp.moveaxis(flat(a), 1, 0), rows)
+    played = play_lanes(sim, reward, flat(keys), of_start, of_step, live, level_first, record=True)
     tree = jnp.repeat(jnp.arange(trees, dtype=jnp.int32), samples)
     # trees run side by side
-    counted = E.tally(played, live, jnp.tile(number, trees) * trees + tree, tree, trees)
-
+    tally = Tally.of(played, live, jnp.tile(number, trees) * trees + tree, tree, trees)
     latent = tuple(
         row if kind == "latent" else () for kind, row in zip(plan.kinds, rows, strict=True)
     )
     number = jnp.broadcast_to(number, (trees, samples))
-    new = Pool(
-        jax.tree.map(apart, played.episode),
-        latent,
-        apart(played.tag),
-        number,
-        jnp.ones_like(number),
+    new = Elites(
+        episode=by_tree(played.episode),
+        latent=latent,
+        tag=by_tree(played.tag),
+        number=number,
+        count=jnp.ones_like(number),
     )
-    pool = jax.vmap(_merge)(pool, new)
-    proposals = jax.vmap(lambda g, p: _fit(g, p, real, plan))(proposals, pool)
-    return (
-        (pool, proposals),
-        counted,
-        pool.episode.reward[:, 0],
-        jax.tree.map(apart, E.trials(played)),
-    )
+    elites = jax.vmap(_merge)(state.elites, new)
+    proposals = jax.vmap(lambda g, e: _fit(g, e, shares, plan))(state.proposals, elites)
+    return State(elites, proposals), tally, by_tree(played.trials())
 
 
-def _propose(keys, sim, real, plan, pool, proposals):
+def _propose(keys, sim, shares, plan, state):
     """Of one tree: the rows [samples, 1, ...] that x0 is made of (``()``: one start), and [samples,
     horizon, ...] those of x.
     """
-    elite = jax.tree.map(lambda a: a[: plan.elites], pool.episode)
+    elite = jax.tree.map(lambda a: a[: plan.elites], state.elites.episode)
     start = outline(sim).random_start
     known = jnp.where(elite.reward > -jnp.inf, 1, -1)
     parents = (
@@ -304,53 +326,49 @@ def _propose(keys, sim, real, plan, pool, proposals):
 
     def rows(part):
         if plan.kinds[part] == "latent":
-            return jax.vmap(lambda k: sequences.sample(k, proposals[part], int(start) * part))(keys)
-        return jax.vmap(lambda k: P.copies(k, *parents[part], real.fresh, part))(keys)
+            steps, offset = state.proposals[part], int(start) * part
+            return jax.vmap(lambda k: sequences.sample(k, steps, offset))(keys)
+        return jax.vmap(lambda k: copy_steps(k, *parents[part], shares.fresh, part))(keys)
 
     return rows(0) if start else (), rows(1)
 
 
-def _fit(proposals, pool, real, plan):
+def _fit(proposals, elites, shares, plan):
     """The proposals of one tree, fitted to the elites at the steps that they reached."""
     z, reward, length = jax.tree.map(
-        lambda a: a[: plan.elites], (pool.latent, pool.episode.reward, pool.episode.length)
+        lambda a: a[: plan.elites], (elites.latent, elites.episode.reward, elites.episode.length)
     )
     known = reward[:, None] > -jnp.inf
-    horizon = jax.tree.leaves(pool.episode.disturbances)[0].shape[1]
+    horizon = jax.tree.leaves(elites.episode.disturbances)[0].shape[1]
     counts = known, known & (jnp.arange(horizon, dtype=jnp.int32)[None] < length[:, None])
     return tuple(
-        sequences.fit(g, v, n, real.smoothing, real.floor) if g != () else ()
+        sequences.fit(g, v, n, shares.smoothing, shares.floor) if g != () else ()
         for g, v, n in zip(proposals, z, counts, strict=True)
     )
 
 
-def _merge(pool, new):
+def _merge(elites, new):
     """The best of both; an episode of reward -inf stands first only where there is no other."""
-    both = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), pool, new)
-    (k,), (n,) = pool.tag.shape, both.tag.shape
-    places, counts = E.distinct(
+    both = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), elites, new)
+    (k,), (n,) = elites.tag.shape, both.tag.shape
+    places, counts = distinct_episodes(
         both.episode.failure, both.episode.reward, both.tag, both.number, both.count, k
     )
     there = places < n
-    taken = _take(both, jnp.where(there | (jnp.arange(k) > 0), places, k))
-    return taken._replace(
-        episode=taken.episode._replace(reward=jnp.where(there, taken.episode.reward, -jnp.inf)),
-        count=counts,
-    )
+    best = _take(both, jnp.where(there | (jnp.arange(k) > 0), places, k))
+    reward = jnp.where(there, best.episode.reward, -jnp.inf)
+    return best._replace(episode=best.episode._replace(reward=reward), count=counts)
 
 
 @partial(jax.jit, static_argnums=(1, 2, 3))
-def _nothing(sim, plan, trees, k, width, around=()):
-    """An empty `Pool` and the first proposals, of every tree."""
-    about = outline(sim)
-    likes = about.x0, about.x
-    latent = [
-        kind == "latent" and bool(jax.tree.leaves(like))
-        for kind, like in zip(plan.kinds, likes, strict=True)
-    ]
+def _first_state(sim, plan, trees, k, width, around=()):
+    """No elites and the first proposals, of every tree."""
+    parts = zip(plan.kinds, (outline(sim).x0, outline(sim).x), (1, sim.horizon), strict=True)
     proposals = tuple(
-        sequences.standard_normal(like, steps, width) if use else ()
-        for use, like, steps in zip(latent, likes, (1, sim.horizon), strict=True)
+        sequences.standard_normal(like, steps, width)
+        if kind == "latent" and jax.tree.leaves(like)
+        else ()
+        for kind, like, steps in parts
     )
     if around:
         proposals = tuple(
@@ -360,35 +378,39 @@ def _nothing(sim, plan, trees, k, width, around=()):
         jax.tree.map(lambda a: jnp.zeros((k, *a.shape), a.dtype), g.mean) if g != () else ()
         for g in proposals
     )
-    zero = lambda dtype: jnp.zeros((k,), dtype)
-    one = Pool(E.blank(sim, k), z, zero(jnp.uint32), zero(jnp.int32), zero(jnp.int32)), proposals
+    zero = jnp.zeros((k,), jnp.int32)
+    elites = Elites(
+        episode=blank_episodes(sim, k),
+        latent=z,
+        tag=zero.astype(jnp.uint32),
+        number=zero,
+        count=zero,
+    )
+    one = State(elites, proposals)
     return jax.tree.map(lambda a: jnp.broadcast_to(a, (trees, *a.shape)), one)
 
 
 @jax.jit
-def _best(pool):
+def _best_episode(elites):
     """The best episode of all trees."""
-    e = jax.tree.map(lambda a: a[:, 0], pool.episode)
+    e = jax.tree.map(lambda a: a[:, 0], elites.episode)
     i = jnp.argmax(jnp.where(e.failure | ~jnp.any(e.failure), e.reward, -jnp.inf))
     return jax.tree.map(lambda a: a[i], e)
 
 
 @partial(jax.jit, static_argnums=1)
-def _archive(pool, top):
+def _best_failures(elites, top):
     """The ``top`` best distinct failures of all trees: (episodes, tree, number, count), reward -inf
     where there are fewer.
     """
-    trees, k = pool.tag.shape
-    flat = jax.tree.map(lambda a: a.reshape(trees * k, *a.shape[2:]), pool._replace(latent=()))
-    value = jnp.where(flat.episode.failure, flat.episode.reward, -jnp.inf)
-    places, counts = E.distinct(flat.episode.failure, value, flat.tag, flat.number, flat.count, top)
+    trees, k = elites.tag.shape
+    flat = jax.tree.map(lambda a: a.reshape(trees * k, *a.shape[2:]), elites._replace(latent=()))
+    failure, reward = flat.episode.failure, flat.episode.reward
+    value = jnp.where(failure, reward, -jnp.inf)
+    places, counts = distinct_episodes(failure, value, flat.tag, flat.number, flat.count, top)
     episode, number = _take((flat.episode, flat.number), places)
-    return (
-        episode._replace(reward=jnp.where(places < trees * k, episode.reward, -jnp.inf)),
-        places // k,
-        number,
-        counts,
-    )
+    reward = jnp.where(places < trees * k, episode.reward, -jnp.inf)
+    return episode._replace(reward=reward), places // k, number, counts
 
 
 def _take(tree, places):

@@ -10,38 +10,57 @@ density of z is Gaussian, and the proposal has that drift already, exactly.
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from jast import _checks
-from jast._jax import is_traced, is_tracing
 from jast.counter import tree_keys
-from jast.incidents import incidents, new_incidents, runs_on_host
+from jast.incidents import runs_on_host
 from jast.limit_state import check, dimension, normal_numbers
 from jast.markov import WIDTHS
 from jast.results import call_settings
-from jast.search import kept as K
-from jast.search import lockstep as E
-from jast.search import tempering as T
-from jast.search.ending import SHARE, ended, planned
+from jast.search.driver import Log, require_counts, require_host, run
+from jast.search.ending import SHARE, with_refine_share
+from jast.search.kept import BestEpisodes, standard_reward
+from jast.search.lockstep import Tally
 from jast.search.result import SearchResult
+from jast.search.tempering import Chains, Points, draw_wider, move_chains, no_points
 from jast.simulator import Simulator
 
 if TYPE_CHECKING:
     import chex
 
-    from jast.typing import Callback
+    from jast.typing import Callback, PathLike
 
 __all__ = ["chain"]
 
-LANES, MOMENTS = 64, 100
-"""Chains, of all widths together: few, as what they need is many moves."""
-FAILING, LOST = 0.1, 3.0
-"""The widest noise is the first of `WIDTHS` of which so many fail; where nothing does, this."""
-LEVELS = 4, 16
+LANES = 64
+"""Chains of all widths: few, as what they need is many moves."""
+MOMENTS = 100
+"""Of the history, about."""
+FAILING_SHARE = 0.1
+"""The widest noise is the first of `WIDTHS` of which so many draws fail."""
+WIDEST_WITHOUT = 3.0
+"""The widest noise where nothing fails."""
+MIN_LEVELS = 4
+"""Widths of the chains, at least."""
+MAX_LEVELS = 16
+"""Widths of the chains, at most."""
+FIRST_SCALE = 0.5
+"""Of the moves, before it adapts."""
+
+
+class State(NamedTuple):
+    """The best so far, draws of ever wider noise, and the chains that began at the failing ones."""
+
+    best: BestEpisodes
+    draws: tuple[Points, ...]
+    """Of each of `WIDTHS`; empty before it was drawn."""
+    chains: Chains
+    widths: np.ndarray
+    """[L] of the chains; 0 before they begin."""
 
 
 def chain(
@@ -54,6 +73,7 @@ def chain(
     top: int = 64,
     progress: bool = False,
     callback: Callback | None = None,
+    checkpoint: PathLike | None = None,
 ) -> SearchResult:
     """Find likely failures of many kinds by Markov chains that never leave the failures.
 
@@ -73,6 +93,8 @@ def chain(
         top: distinct failures kept.
         progress: show a bar.
         callback: called as ``callback(done, total, None)``, in episodes.
+        checkpoint: a folder that keeps what the chains came to now and then. The same call then
+            goes on where it was stopped, to the same result.
 
     Returns:
         `SearchResult`: the likeliest of all failures that a chain was offered. Their reward is that
@@ -95,90 +117,93 @@ def chain(
         True
     """
     name = "chain"
-    episodes, top = E.whole(name, episodes=episodes, top=top)
+    episodes, top = require_counts(name, episodes=episodes, top=top)
     expected = "above 0 and below 1"
     narrowest = _checks.number(name, "narrowest", narrowest, lambda v: 0 < v < 1, expected)
-    _checks.check_random_key(name, key)
-    if is_traced(key, sim) or is_tracing():
-        raise ValueError(f"{name}: cannot be traced; call it outside of jax.jit and jax.vmap")
+    require_host(name, key, sim)
     check(name, sim)
-    settings = call_settings(name, key, episodes=episodes, narrowest=narrowest)
-    settings = planned(name, refine, sim, settings, SHARE)
-    size = max(2 * LEVELS[0], min(LANES, 1 << max(0, (episodes // 16).bit_length())))
-    steps = math.ceil(math.log(LOST / narrowest) * math.sqrt(dimension(sim)) / 2)
-    levels = min(max(steps + 1, LEVELS[0]), LEVELS[1], size // 2)
-    shape = levels, size // levels
-    search = _Search(key, sim, shape, narrowest)
-    lanes = shape[0] * shape[1]
-    before = incidents(sim)
+    given = dict(episodes=episodes, narrowest=narrowest)
+    settings = with_refine_share(name, refine, sim, call_settings(name, key, **given), SHARE)
+    search = _Search(key, sim, episodes, narrowest, top)
+    lanes = search.levels * search.chains
     stretch = lanes if runs_on_host(sim) else lanes * max(1, episodes // (lanes * MOMENTS))
-    looks = [lanes * (i + 1) for i in range(len(WIDTHS))]
-    ends = [*looks, *range(looks[-1] + stretch, episodes, stretch)]
-    ends = [*(end for end in ends if end < episodes), episodes]
-    (kept, chains, widths, _), log = E.drive(
-        search.chunk,
-        (K.none(sim, max(top, 64)), None, (), []),
-        ends,
-        host=runs_on_host(sim),
+    draws = [lanes * (i + 1) for i in range(len(WIDTHS))]
+    ends = [*draws, *range(draws[-1] + stretch, episodes, stretch)]
+    return run(
+        key,
+        search,
+        [*(end for end in ends if end < episodes), episodes],
+        settings,
         progress=progress,
         callback=callback,
-        name=name,
+        checkpoint=checkpoint,
     )
-    if chains is not None:
-        share = lambda a: np.round(np.asarray(a, float), 4).tolist()
-        settings |= dict(
-            widths=share(widths), accepted=share(chains.accepted), swapped=share(chains.swapped)
-        )
-    found = K.result(sim, search.reward, log, kept, settings, top)
-    found = ended(key, sim, search.reward, found, top)
-    return found._replace(incidents=new_incidents(before, incidents(sim)))
 
 
 class _Search:
-    """What does not change while a search runs."""
+    """A `jast.search.driver.Search`."""
 
-    def __init__(self, key, sim, shape, narrowest):
-        self.key, self.sim, self.reward = tree_keys(key, 1)[0], sim, K.likelihood(sim)
-        self.shape, self.narrowest = shape, narrowest
+    def __init__(self, key: jax.Array, sim: Simulator, episodes: int, narrowest: float, top: int):
+        self.sim, self.reward, self.top = sim, standard_reward(sim), top
+        self.key, self.narrowest = tree_keys(key, 1)[0], narrowest
+        lanes = max(2 * MIN_LEVELS, min(LANES, 1 << max(0, (episodes // 16).bit_length())))
+        # the logarithms of neighbouring widths differ by 2 / sqrt(D), so that they exchange points
+        ratios = math.log(WIDEST_WITHOUT / narrowest) * math.sqrt(dimension(sim)) / 2
+        self.levels = min(max(math.ceil(ratios) + 1, MIN_LEVELS), MAX_LEVELS, lanes // 2)
+        self.chains = lanes // self.levels
 
-    def chunk(self, carry, begin, end):
-        """Episodes ``begin`` .. ``end - 1``: look for failures, or move the chains."""
-        kept, chains, widths, looks = carry
-        ends = jnp.asarray(begin, jnp.int32), jnp.asarray(end, jnp.int32)
-        if chains is None and not self._enough(looks):
-            width = jnp.asarray(WIDTHS[len(looks)], normal_numbers(self.sim))
-            lanes = self.shape[0] * self.shape[1]
-            (kept, look), counted = T.look(
-                self.key, self.sim, self.reward, lanes, kept, *ends, width
-            )
-            looks = [*looks, (float(width), look)]
+    def init(self) -> State:
+        d, real, levels = dimension(self.sim), normal_numbers(self.sim), self.levels
+        draws, zero = (no_points(0, d, real),) * len(WIDTHS), np.zeros(levels, real)
+        chains = Chains(no_points(levels, d, real), zero, zero, zero[1:])
+        return State(BestEpisodes.none(self.sim, max(self.top, 64)), draws, chains, zero)
+
+    def step(self, state: State, begin: int, end: int) -> tuple[State, Tally, jax.Array, None]:
+        """Draw noise of the next width, or move the chains."""
+        best, draws, chains, widths = state
+        common, ends = (self.key, self.sim, self.reward), (np.int32(begin), np.int32(end))
+        lanes = self.levels * self.chains
+        drawn = draws[: begin // lanes]  # while there are no chains
+        if not widths[0] and not self._enough(drawn):
+            width = np.asarray(WIDTHS[len(drawn)], widths.dtype)
+            (best, points), tally = draw_wider(*common, lanes, best, *ends, width)
+            draws = (*drawn, points, *draws[len(drawn) + 1 :])
         else:
-            if chains is None:
-                chains, widths = self._begun(looks)
-            (kept, chains), counted = T.walk(
-                self.key, self.sim, self.reward, kept, chains, widths, *ends
-            )
-        return (kept, chains, widths, looks), counted, K.best_of(kept), None
+            if not widths[0]:
+                chains, widths = self.first_chains(drawn)
+            (best, chains), tally = move_chains(*common, best, chains, widths, *ends)
+        return State(best, draws, chains, widths), tally, best.reward(), None
 
-    def _enough(self, looks):
-        share = lambda look: float(np.asarray(look[1][2]).mean())
-        return len(looks) == len(WIDTHS) or (looks and share(looks[-1]) >= FAILING)
+    def _enough(self, draws: tuple[Points, ...]) -> bool:
+        failing = bool(draws) and np.mean(draws[-1].failing) >= FAILING_SHARE
+        return failing or len(draws) == len(WIDTHS)
 
-    def _begun(self, looks):
+    def first_chains(self, draws: tuple[Points, ...]) -> tuple[Chains, np.ndarray]:
         """The chains and their widths: of the failures at the width that has most of them, up to
         the first that has enough; else of the nearest draws.
         """
-        shares = [float(np.asarray(look[2]).mean()) for _, look in looks]
-        i = int(np.argmax(shares)) if max(shares) > 0 else [w for w, _ in looks].index(LOST)
-        widest, (z, used, failing, distance) = looks[i]
-        rank = np.where(np.asarray(failing), -np.inf, np.asarray(distance))
+        shares = [float(np.mean(points.failing)) for points in draws]
+        i = int(np.argmax(shares)) if max(shares) > 0 else WIDTHS.index(WIDEST_WITHOUT)
+        points = jax.device_get(draws[i])
+        rank = np.where(points.failing, -np.inf, points.distance)
         order = np.argsort(rank, kind="stable")
-        known = int(np.asarray(failing).sum()) or len(order)
-        levels, chains = self.shape
+        usable = int(points.failing.sum()) or len(order)
         # those of one width differ as far as there are enough
-        rows = order[(np.arange(levels)[:, None] + levels * np.arange(chains)[None]) % known]
-        real = z.dtype
-        widths = np.geomspace(max(widest, 1.0), self.narrowest, levels)
-        none, scale = np.zeros(levels, real), np.full(levels, 0.5, real)
-        state = jax.tree.map(lambda a: np.asarray(a)[rows], (z, used, failing, distance))
-        return T.Chains(*state, scale, none, none[1:]), widths.astype(real)
+        level, column = np.indices((self.levels, self.chains))
+        rows = order[(level + self.levels * column) % usable]
+        widths = np.geomspace(max(WIDTHS[i], 1.0), self.narrowest, self.levels)
+        real = points.z.dtype
+        zero, scale = np.zeros(self.levels, real), np.full(self.levels, FIRST_SCALE, real)
+        chains = Chains(jax.tree.map(lambda a: a[rows], points), scale, zero, zero[1:])
+        return chains, widths.astype(real)
+
+    def result(self, state: State, log: Log, settings: dict[str, Any]) -> SearchResult:
+        if state.widths[0]:
+            shares = dict(
+                widths=state.widths,
+                accepted=state.chains.accepted,
+                swapped=state.chains.swapped,
+            )
+            shares = {k: np.round(np.asarray(a, float), 4).tolist() for k, a in shares.items()}
+            settings = settings | shares
+        return state.best.result(self, log, settings)

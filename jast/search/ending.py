@@ -1,5 +1,7 @@
 """The end of a search: its failures, pulled to where they are likeliest (`jast.search.refine`)."""
 
+import contextvars
+from functools import partial
 from typing import Any
 
 import jax
@@ -12,23 +14,25 @@ from jast.failures import collect, identity, merge
 from jast.incidents import runs_on_host
 from jast.outline import outline
 from jast.rewards import Lexicographic, likelihood
-from jast.search.refinement import refine as pull
+from jast.search.refinement import refine
 from jast.search.result import SearchResult
 from jast.simulator import Simulator
 
-__all__ = ["REFINED", "SHARE", "ended", "planned", "usual"]
+__all__ = ["REFINED", "SHARE", "default_share", "refine_failures", "with_refine_share"]
 
-SHARE, LEAST = 0.1, 100
-"""Evaluations of the refinement, as a share of the search's episodes; fewer are not worth it."""
-FEW = 16
-"""Failures of a system on the host that are refined at most: each has to run once more for that."""
+SHARE = 0.1
+"""Evaluations of the refinement by default, as a share of the search's episodes; a convention."""
+MIN_BUDGET = 100
+"""Evaluations below which there is no refinement: `jast.search.refine` takes no fewer."""
+MAX_HOSTED = 16
+"""Failures of a system on the host that are refined: each has to run once more for that."""
 ADDRESS = 0x656E6421
 """Folded into the search's key, far from the numbers of trees."""
 REFINED = -2
 """The tree that refined failures are said to be of."""
 
 
-def usual(sim: Simulator, reward: Any) -> float:
+def default_share(sim: Simulator, reward: Any) -> float:
     """The share of a search that maximises ``reward``: `SHARE` where that ranks failures as
     `jast.search.refine` does, a `Lexicographic` one (unless its log p is raw though there are
     modes), else 0.
@@ -37,7 +41,7 @@ def usual(sim: Simulator, reward: Any) -> float:
     return SHARE if same else 0.0
 
 
-def planned(
+def with_refine_share(
     function: str,
     refine: float | None,
     sim: Simulator,
@@ -77,22 +81,23 @@ def planned(
     return None if settings is None else settings | dict(refine=share)
 
 
-def ended(
+def refine_failures(
     key: jax.Array, sim: Simulator, reward: Any, found: SearchResult, top: int
 ) -> SearchResult:
-    """``found`` with its failures refined, by the share in its settings (`planned`), and with what
-    came of that among them; as it is where there is nothing to refine, where that would be fewer
-    than 100 evaluations, and where the search is traced or was interrupted.
+    """``found`` with its failures refined, by the share in its settings (`with_refine_share`), and
+    with what came of that among them; as it is where there is nothing to refine, where that would
+    be fewer than 100 evaluations, and where the search is traced or was interrupted.
     """
     settings = found.settings
     if settings is None or "interrupted" in settings or not len(found.failures):
         return found
-    budget = int(settings["refine"] * found.episodes)
-    if budget < LEAST:
+    budget = int(settings.get("refine", 0) * found.episodes)
+    if budget < MIN_BUDGET:
         return found
-    work = lambda: _refined(jax.random.fold_in(key, ADDRESS), sim, reward, found, top, budget)
+    work = partial(_refined, jax.random.fold_in(key, ADDRESS), sim, reward, found, top, budget)
     try:
-        return run_in_thread(work) if runs_on_host(sim) else work()
+        # in the context of this thread: a checkpoint keeps what the refinement asks
+        return run_in_thread(contextvars.copy_context().run, work) if runs_on_host(sim) else work()
     except KeyboardInterrupt:
         note = f"while refining, after all {found.episodes} episodes"
         return found._replace(settings=settings | dict(interrupted=note))
@@ -102,13 +107,13 @@ def _refined(
     key: jax.Array, sim: Simulator, reward: Any, found: SearchResult, top: int, budget: int
 ) -> SearchResult:
     archive = found.failures
-    first = archive[:FEW] if runs_on_host(sim) else archive
+    first = archive[:MAX_HOSTED] if runs_on_host(sim) else archive
     given = collect(sim, likelihood(sim), first.episodes, top=len(first))
     # none where all are on a knife edge, or the density at the mode is infinite
     given = given[: int(np.isfinite(given.episodes.reward).sum())]
     if not len(given):
         return found
-    refined = pull(key, sim, given, budget=budget)
+    refined = refine(key, sim, given, budget=budget)
     before = dict(given=len(given), likeliest=float(given.best.reward))
     refined = refined._replace(
         settings=refined.settings | before | dict(density=outline(sim).density)

@@ -18,7 +18,7 @@ from jast.search.centred import centred
 from jast.search.paths import ALIKE, Paths, assigned, components, moved_in_time
 from jast.simulator import Simulator
 
-__all__ = ["Mode", "Modes", "modes"]
+__all__ = ["UNKNOWN", "Mode", "Modes", "modes", "owners", "pointing", "spread"]
 
 UNKNOWN = (math.nan, math.nan)
 
@@ -93,9 +93,10 @@ class Modes(tuple):
         Raises:
             ImportError: where pandas is not installed.
         """
-        of = lambda name: [np.asarray(getattr(m.failure, name)).item() for m in self]
-        columns = [("mode", np.arange(1, len(self) + 1)), ("log_prob_from_mode", of("reward"))]
-        columns += [(name, of(name)) for name in ("log_prob", "distance", "length")]
+        columns = [("mode", np.arange(1, len(self) + 1))]
+        for field in ("reward", "log_prob", "distance", "length"):
+            name = "log_prob_from_mode" if field == "reward" else field
+            columns.append((name, [np.asarray(getattr(m.failure, field)).item() for m in self]))
         columns += [("members", [m.members for m in self]), ("share", [m.share for m in self])]
         for i, end in enumerate(("share_low", "share_high")):
             columns.append((end, [m.share_interval[i] for m in self]))
@@ -154,11 +155,12 @@ def modes(
     if not n:
         return Modes()
     found = [likeliest] if others is None or not len(others) else [likeliest, others]
-    together = lambda of: np.concatenate([of(f) for f in found])
     paths = Paths(centred(sim), budget)
-    v = together(lambda f: np.asarray(normal_of(paths.sim, f.episodes), np.float64))
-    ends, counts = together(lambda f: f.episodes.length), together(lambda f: f.counts)
-    owner = components(paths, v, ends, together(lambda f: _cost(paths, sim, f)), n)
+    points = [np.asarray(normal_of(paths.sim, f.episodes), np.float64) for f in found]
+    v, cost = np.concatenate(points), np.concatenate([_cost(paths, sim, f) for f in found])
+    ends = np.concatenate([f.episodes.length for f in found])
+    counts = np.concatenate([f.counts for f in found])
+    owner = components(paths, v, ends, cost, n)
     known = np.isin(owner, owner[:n])
     if not known.all():
         owner[~known] = assigned(
@@ -175,11 +177,14 @@ def _cost(paths, sim, failures):
     """By how many nats each of ``failures`` is rarer than the mode: [n]; their reward says it,
     unless another one ranks them.
     """
-    log_p, known = likelihood(sim), failures.episodes.reward
-    score = lambda e: float(replay(sim, e, reward=log_p).reward)
-    other = not np.isclose(score(failures[0]), known[0])
+    rewards = failures.episodes.reward
+
+    def log_p(e):
+        return float(replay(sim, e, reward=likelihood(sim)).reward)
+
+    other = not np.isclose(log_p(failures[0]), rewards[0])
     paths.judge.spent += 1 + other * len(failures)
-    return -np.array([score(e) for e in failures]) if other else -known
+    return -np.array([log_p(e) for e in failures]) if other else -rewards
 
 
 def spread(sim: Simulator, failures: Failures, top: int) -> Failures:
@@ -201,9 +206,9 @@ def owners(sim: Simulator, episodes: Episode, heads: Episode) -> np.ndarray:
     """
     if len(heads.length) == 1:
         return np.zeros(len(episodes.length), int)
-    of_modes = centred(sim)
-    place = lambda e: (normal_of(of_modes, e), np.asarray(e.length))
-    return pointing(sim, *place(episodes), *place(heads))
+    of_modes, last = centred(sim), np.asarray(heads.length)
+    points, ends = normal_of(of_modes, episodes), np.asarray(episodes.length)
+    return pointing(sim, points, ends, normal_of(of_modes, heads), last)
 
 
 def pointing(

@@ -9,7 +9,6 @@ level that is held, at an end of its range for some seconds.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -17,43 +16,55 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jast import _checks
-from jast._jax import is_traced, is_tracing, jit
-from jast._threads import run_in_thread
-from jast.incidents import incidents, new_incidents, runs_on_host
-from jast.limit_state import check, normal_numbers, outcome, played
+from jast._jax import jit
+from jast.limit_state import Outcomes, check, normal_numbers, outcome, played
 from jast.outline import outline
 from jast.pytrees import count_numbers, map_in_lanes
 from jast.results import call_settings
-from jast.search import kept as K
-from jast.search import lockstep as E
-from jast.search.result import History, SearchResult
+from jast.search.driver import Log, finish, require_counts, require_host, run
+from jast.search.kept import standard_reward
+from jast.search.lockstep import NEVER, Tally
+from jast.search.result import SearchResult
 from jast.simulator import Simulator
-from jast.watch import Watch, in_pieces
 
 if TYPE_CHECKING:
     import chex
 
-    from jast.typing import Callback
+    from jast.typing import Callback, PathLike
 
 __all__ = ["falsify"]
 
-AT_ONCE = 64
+LANES = 64
 """Failures whose normal numbers one program, of one shape, makes."""
 TAIL = 3e-5
-"""Probability beyond what is taken for an end of a disturbance's range."""
-FRESH, POOL = 30, 10
-"""Signals that are drawn before any is changed, and how many are kept to be changed."""
+"""Probability beyond what is taken for an end of a disturbance's range: 4 standard deviations."""
+FIRST_SIGNALS = 30
+"""Signals of few pieces that are drawn before any is changed."""
+POOL = 10
+"""Nearest signals that are kept to be changed."""
 PIECES = 1, 2, 3, 5, 10
-CROSSED, STEP = 0.3, 0.25
-"""The share of children of two parents, and the deviation of a change of u."""
+"""Numbers of pieces of the first signals, beside one piece a step."""
+CROSSOVER = 0.3
+"""Share of the children that have two parents."""
+STEP = 0.25
+"""Standard deviation of a move of u."""
+MORE_CHANGES = 0.7
+"""Mean number of the changes of a child beyond the first."""
+ONE_COLUMN = 0.6
+"""Share of the changes that are of one number of the disturbance; the others are of all."""
+MOVED_AS_ONE = 0.35
+"""Share of the changes that move a stretch by one amount, which keeps its shape."""
+MOVED_APART = 0.25
+"""Share of those that move each of its steps by itself."""
+HELD_ANYWHERE = 0.2
+"""Share of those that hold it at a level drawn anew; the others hold it at an end of the range."""
 
 
-class _Pool(NamedTuple):
+class Pool(NamedTuple):
     """The nearest episodes, by rising miss distance."""
 
     score: np.ndarray
-    """[m]"""
+    """[m] what they rank by: the miss distance, -1 for a failure, inf where invalid."""
     rows: np.ndarray
     """[m, horizon, k]: u of the disturbances"""
     first: np.ndarray
@@ -62,16 +73,14 @@ class _Pool(NamedTuple):
     """[m] steps: what is beyond decided nothing"""
 
 
-class _Found(NamedTuple):
+class State(NamedTuple):
     """A search so far."""
 
-    pool: _Pool
-    failing: tuple
-    """(number, u [D]) of each failure"""
-    counts: tuple[int, int, int, int]
-    """Episodes, steps, failures, invalid ones"""
-    moments: tuple
-    """After each batch: episodes, minus the least distance [1], failures"""
+    pool: Pool
+    numbers: np.ndarray
+    """[m] of the failing episodes"""
+    failing: np.ndarray
+    """[m, D] their u"""
 
 
 def falsify(
@@ -84,6 +93,7 @@ def falsify(
     top: int = 64,
     progress: bool = False,
     callback: Callback | None = None,
+    checkpoint: PathLike | None = None,
 ) -> SearchResult:
     """Find a failure with few simulations, however unlikely it is.
 
@@ -104,6 +114,8 @@ def falsify(
         top: distinct failures kept.
         progress: whether to show a progress bar.
         callback: called as ``callback(done, total, None)``, in simulations, after each batch.
+        checkpoint: a folder that keeps finished batches. The same call then goes on where it was
+            stopped, to the same result.
 
     Returns:
         `SearchResult`, whose ``first_failure`` is how many simulations it took. Failures are ranked
@@ -120,68 +132,83 @@ def falsify(
         True
     """
     name = "falsify"
-    simulations, batch, top = E.whole(name, simulations=simulations, batch=batch, top=top)
-    _checks.check_random_key(name, key)
-    if is_traced(key, sim) or is_tracing():
-        raise ValueError(f"{name}: cannot be traced; call it outside of jax.jit and jax.vmap")
+    simulations, batch, top = require_counts(name, simulations=simulations, batch=batch, top=top)
+    require_host(name, key, sim)
     check(name, sim)
-    settings = call_settings(name, key, simulations=simulations, batch=batch, stop=int(stop))
-    work, before = _Work(sim, settings["seed"], batch, bool(stop)), incidents(sim)
-    watch = Watch(name, simulations, "sim", progress, callback)
-    found, done = in_pieces(work, work.nothing(), work.ends(simulations), watch)
-    if done < simulations and not work.over:
-        settings |= dict(interrupted=f"after {done} of {simulations} episodes")
-    result = _result(sim, found, settings, top)
-    return result._replace(incidents=new_incidents(before, incidents(sim)))
+    given = dict(simulations=simulations, batch=batch, stop=int(stop))
+    settings = call_settings(name, key, **given)
+    return run(
+        key,
+        _Search(sim, settings["seed"], batch, top),
+        [*range(batch, simulations, batch), simulations],
+        settings,
+        stop_at_failure=bool(stop),
+        progress=progress,
+        callback=callback,
+        checkpoint=checkpoint,
+    )
 
 
-class _Work:
-    """What does not change while a search runs, but whether it is ``over``."""
+class _Search:
+    """A `jast.search.driver.Search`."""
 
-    def __init__(self, sim: Simulator, seed: Any, batch: int, stop: bool):
-        about = outline(sim)
-        self.sim, self.seed, self.batch, self.stop, self.over = sim, seed, batch, stop, False
-        self.k0, self.k, self.dtype = (
-            count_numbers(about.x0),
-            count_numbers(about.x),
-            normal_numbers(sim),
-        )
+    def __init__(self, sim: Simulator, seed: Any, batch: int, top: int):
+        like = outline(sim)
+        self.sim, self.reward, self.top = sim, standard_reward(sim), top
+        self.seed, self.batch = seed, batch
+        self.start_size, self.step_size = count_numbers(like.x0), count_numbers(like.x)
 
-    def nothing(self) -> _Found:
-        rows, first = np.zeros((0, self.sim.horizon, self.k)), np.zeros((0, self.k0))
-        return _Found(_Pool(np.zeros(0), rows, first, np.zeros(0, int)), (), (0, 0, 0, 0), ())
+    def init(self) -> State:
+        horizon, k, k0 = self.sim.horizon, self.step_size, self.start_size
+        rows, first = np.zeros((0, horizon, k)), np.zeros((0, k0))
+        pool = Pool(np.zeros(0), rows, first, np.zeros(0, np.int32))
+        return State(pool, np.zeros(0, np.int64), np.zeros((0, k0 + horizon * k)))
 
-    def ends(self, simulations: int) -> Iterator[int]:
-        for begin in range(0, simulations, self.batch):
-            if not self.over:
-                yield min(begin + self.batch, simulations)
-
-    def __call__(self, found: _Found, begin: int, end: int) -> _Found:
+    def step(self, state: State, begin: int, end: int) -> tuple[State, Tally, np.ndarray, None]:
         """One more batch."""
-        n, pool = end - begin, found.pool
+        n, pool = end - begin, state.pool
         rng = np.random.default_rng([*self.seed, begin])
-        signals = [_signal(rng, pool, begin + i, pool.rows.shape[1:], self.k0) for i in range(n)]
+        signals = [signal(rng, pool, begin + i) for i in range(n)]
         rows, first = (np.stack(a) for a in zip(*signals, strict=True))
         u = np.concatenate([first, rows.reshape(n, -1)], axis=1)
         lanes = np.pad(u, ((0, self.batch - n), (0, 0)), mode="edge")
-        ask = lambda: jax.device_get(_judged(self.sim, lanes.astype(self.dtype)))
-        o = jax.tree.map(lambda a: a[:n], run_in_thread(ask) if runs_on_host(self.sim) else ask())
+        o = jax.device_get(_outcomes(self.sim, lanes.astype(normal_numbers(self.sim))))
+        o = jax.tree.map(lambda a: a[:n], o)
         score = np.where(o.invalid, np.inf, np.where(o.failure, -1, o.distance))
-        new = score, rows, first, o.length
-        every = (np.concatenate(p) for p in zip(pool, new, strict=True))
-        every = _Pool(*every)
-        best = np.argsort(every.score, kind="stable")[:POOL]
-        pool = jax.tree.map(lambda a: a[best], every)
-        failing = tuple((begin + int(i), u[i]) for i in np.flatnonzero(o.failure))
-        counts = n, int(o.length.sum()), len(failing), int(o.invalid.sum())
-        counts = tuple(a + b for a, b in zip(found.counts, counts, strict=True))
-        self.over = self.stop and counts[2] > 0
-        moment = end, np.array([-max(pool.score[0], 0)]), counts[2]
-        return _Found(pool, found.failing + failing, counts, (*found.moments, moment))
+        new = Pool(score, rows, first, o.length)
+        pool = jax.tree.map(lambda *a: np.concatenate(a), pool, new)
+        best = np.argsort(pool.score, kind="stable")[:POOL]
+        pool = jax.tree.map(lambda a: a[best], pool)
+        failing = np.flatnonzero(o.failure)
+        tally = Tally(
+            episodes=n,
+            steps=o.length.sum(),
+            failures=len(failing),
+            invalid=o.invalid.sum(),
+            first=begin + failing[0] + 1 if len(failing) else NEVER,
+            failing=np.array([len(failing) > 0]),
+        )
+        numbers = np.concatenate([state.numbers, begin + failing])
+        state = State(pool, numbers, np.concatenate([state.failing, u[failing]]))
+        return state, tally, np.array([-max(pool.score[0], 0)]), None
+
+    def result(self, state: State, log: Log, settings: dict[str, Any]) -> SearchResult:
+        pool, numbers = state.pool, state.numbers
+        once = np.ones(len(numbers), np.int32)
+        nearest = np.concatenate([pool.first[0], pool.rows[0].ravel()])
+        u = state.failing if len(numbers) else nearest[None]
+        normal = map_in_lanes(LANES, _normal, u.astype(normal_numbers(self.sim)))
+        e = played(self.sim, normal)
+        failing, nearest = jax.tree.map(lambda a: a[: len(numbers)], e), jax.tree.map(_first, e)
+        return finish(self, log, nearest, failing, numbers, counts=once, settings=settings)
+
+
+def _first(a: np.ndarray) -> np.ndarray:
+    return a[0]
 
 
 @jit
-def _judged(sim: Simulator, u: jax.Array) -> Any:
+def _outcomes(sim: Simulator, u: jax.Array) -> Outcomes:
     """`Outcomes` [n] of the levels ``u`` [n, D]."""
     return jax.vmap(partial(outcome, sim))(_normal(u))
 
@@ -191,38 +218,48 @@ def _normal(u: jax.Array) -> jax.Array:
     return jax.scipy.special.ndtri(jnp.clip(u, TAIL, 1 - TAIL))
 
 
-def _signal(
-    rng: np.random.Generator, pool: _Pool, i: int, shape: tuple[int, int], k0: int
-) -> tuple[np.ndarray, np.ndarray]:
-    """The ``i``-th episode: levels of the disturbances [horizon, k] and of the start [k0]."""
-    if i < FRESH or not len(pool.score):
-        return _drawn(rng, *shape, k0)
-    m = len(pool.score)
+def signal(rng: np.random.Generator, pool: Pool, number: int) -> tuple[np.ndarray, np.ndarray]:
+    """The episode of this ``number``: levels of the disturbances [horizon, k] and of the start
+    [k0].
+    """
+    m, horizon, k = pool.rows.shape
+    k0 = pool.first.shape[1]
+    if number < FIRST_SIGNALS or not m:
+        return _few_pieces(rng, horizon, k, k0)
     parent = int(m * rng.uniform() ** 2)  # rather a near one
     rows, first = pool.rows[parent].copy(), pool.first[parent].copy()
-    length, k = max(int(pool.length[parent]), 1), shape[1]
-    if rng.uniform() < CROSSED and length > 1:
+    length = max(int(pool.length[parent]), 1)
+    if rng.uniform() < CROSSOVER and length > 1:
         at = rng.integers(1, length)
         rows[at:] = pool.rows[rng.integers(m)][at:]
-    for _ in range(1 + rng.poisson(0.7) if k else 0):
-        begin = rng.integers(length)
-        end = begin + 1 + int(length / 3 * rng.uniform() ** 2)
-        columns = [rng.integers(k)] if rng.uniform() < 0.6 else range(k)
-        kind = rng.uniform()
-        for c in columns:
-            part = rows[begin:end, c]
-            if kind < 0.6:  # moved, as one or each by itself
-                size = 1 if kind < 0.35 else len(part)
-                part = np.clip(part + STEP * rng.normal(size=size), 0, 1)
-            else:  # held
-                part = rng.uniform() if kind < 0.8 else rng.integers(2)
-            rows[begin:end, c] = part
+    for _ in range(1 + rng.poisson(MORE_CHANGES) if k else 0):
+        _change(rng, rows, length)
     if k0 and (k == 0 or rng.uniform() < 0.5):
         first = np.clip(first + STEP * rng.normal(size=k0), 0, 1)
     return rows, first
 
 
-def _drawn(
+def _change(rng: np.random.Generator, rows: np.ndarray, length: int) -> None:
+    """Move or hold a stretch of ``rows`` [horizon, k], in place; a short one rather than a long
+    one, within the first ``length`` steps at its begin.
+    """
+    k = rows.shape[1]
+    begin = rng.integers(length)
+    end = begin + 1 + int(length / 3 * rng.uniform() ** 2)
+    columns = [rng.integers(k)] if rng.uniform() < ONE_COLUMN else range(k)
+    kind = rng.uniform()
+    moved = MOVED_AS_ONE + MOVED_APART
+    for column in columns:
+        part = rows[begin:end, column]
+        if kind < moved:
+            size = 1 if kind < MOVED_AS_ONE else len(part)
+            part = np.clip(part + STEP * rng.normal(size=size), 0, 1)
+        else:
+            part = rng.uniform() if kind < moved + HELD_ANYWHERE else rng.integers(2)
+        rows[begin:end, column] = part
+
+
+def _few_pieces(
     rng: np.random.Generator, horizon: int, k: int, k0: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """An episode of few pieces, held each, at the ends of their ranges or anywhere."""
@@ -232,25 +269,3 @@ def _drawn(
     if rng.uniform() < 0.5:
         levels, first = np.round(levels), np.round(first)
     return levels[np.searchsorted(cuts, np.arange(horizon), side="right")], first
-
-
-def _result(sim: Simulator, found: _Found, settings: dict, top: int) -> SearchResult:
-    reward, pool = K.likelihood(sim), found.pool
-    points = [u for _, u in found.failing] or [
-        np.concatenate([pool.first[0], pool.rows[0].ravel()])
-    ]
-    points = np.stack(points).astype(normal_numbers(sim))
-    e = played(sim, map_in_lanes(AT_ONCE, _normal, points))
-    numbers = [i for i, _ in found.failing]
-    failing = jax.tree.map(lambda a: a[: len(numbers)], e)
-    ends, best, failures = zip(*found.moments, strict=True)
-    first = numbers[0] + 1 if numbers else E.NEVER
-    log = E.Log(
-        E.Tally(*found.counts, first, np.array([bool(numbers)])),
-        History(np.array(ends), np.array(best), np.array(failures)),
-        settings.get("interrupted"),
-        None,
-    )
-    nearest = jax.tree.map(lambda a: a[0], e)
-    of = [0] * len(numbers), numbers, [1] * len(numbers)
-    return E.finish(sim, reward, log, nearest, failing, *of, settings, top)

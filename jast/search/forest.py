@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Literal
 
 from jast.search.tree.grow import grow_trees
-from jast.search.tree.settings import PLAIN, settled
+from jast.search.tree.settings import PLAIN
 
 if TYPE_CHECKING:
     import chex
@@ -174,33 +174,4 @@ def forest(
         >>> bool(result.best.failure)
         True
     """
-    given = dict(
-        widening=widening, spread=spread, focus=focus, follow=follow, feed=feed, urgent=urgent
-    )
-    return grow_trees(
-        "forest",
-        key,
-        sim,
-        settled("forest", MODES, mode, actions, **given),
-        trees=trees,
-        prunes=prunes,
-        simulations=simulations,
-        heads=heads,
-        head_settings=head_settings,
-        reward=reward,
-        actions=actions,
-        exploration=exploration,
-        memoize=memoize,
-        refine=refine,
-        top=top,
-        record=record,
-        keep_trees=keep_trees,
-        threads=threads,
-        lanes=lanes,
-        available=available,
-        progress=progress,
-        callback=callback,
-        checkpoint=checkpoint,
-        executor=executor,
-        devices=devices,
-    )
+    return grow_trees("forest", MODES, **locals())

@@ -10,42 +10,60 @@ ways to a failure.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import numpy as np
 
 from jast import _checks, memory
-from jast._jax import is_traced, is_tracing
 from jast.contract import contract
-from jast.counter import numpy_generator, tree_keys
-from jast.incidents import incidents, new_incidents, runs_on_host
+from jast.counter import tree_keys
+from jast.episode import Episode
+from jast.incidents import runs_on_host
 from jast.outline import outline
 from jast.results import call_settings
 from jast.rewards import as_pytree
-from jast.search import cells as C
-from jast.search import kept as K
-from jast.search import lockstep as E
-from jast.search import phases as P
-from jast.search.ending import SHARE, ended, planned
+from jast.search.cells import Cells, empty_cells, features
+from jast.search.driver import Log, require_counts, require_host, run
+from jast.search.ending import SHARE, with_refine_share
+from jast.search.kept import BestEpisodes, standard_reward
+from jast.search.lockstep import Tally, blank_episodes
+from jast.search.phases import Plan, Traces, explore, improve_backward
 from jast.search.result import SearchResult
 from jast.simulator import Simulator, require_simulator
 
 if TYPE_CHECKING:
     import chex
 
-    from jast.typing import Callback
+    from jast.typing import Callback, PathLike
 
 __all__ = ["go_explore"]
 
-LANES, HOSTED, SLOTS, TRACES = 256, 64, 4096, 4
-"""Runs side by side; of a system on the host; states kept; failures that are made likelier side by
-side.
-"""
+LANES = 256
+"""Runs side by side."""
+HOSTED_LANES = 64
+"""Those of a system on the host, which is watched and interrupted between two rounds of them."""
+SLOTS = 4096
+"""States that are kept at most."""
+TRACES = 4
+"""Failures that are made likelier side by side."""
 BACK = 0.6
 """Share of that work before it is at the start."""
 MOMENTS = 100
+"""Of the history, about."""
+
+
+class State(NamedTuple):
+    """A search so far."""
+
+    cells: Cells
+    best: BestEpisodes
+    traces: Traces
+    """The failures that are made likelier."""
+    since: int
+    """The run from which on they are; -1 before it, when ``traces`` mean nothing."""
 
 
 def go_explore(
@@ -60,6 +78,7 @@ def go_explore(
     top: int = 64,
     progress: bool = False,
     callback: Callback | None = None,
+    checkpoint: PathLike | None = None,
 ) -> SearchResult:
     """Find failures that need many things to go wrong one after another: for long horizons, and for
     systems that do not say how near a failure is.
@@ -86,6 +105,8 @@ def go_explore(
         top: distinct failures kept.
         progress: show a bar.
         callback: called as ``callback(done, total, None)``, in runs.
+        checkpoint: a folder that keeps what the search came to now and then. The same call then
+            goes on where it was stopped, to the same result.
 
     Returns:
         `SearchResult`. ``best`` is the likeliest failure, or the episode that came nearest; its
@@ -110,47 +131,45 @@ def go_explore(
     """
     name = "go_explore"
     require_simulator(name, sim)
-    episodes, top = E.whole(name, episodes=episodes, top=top)
-    length = (
-        max(1, -(-sim.horizon // 8))
-        if length is None
-        else _checks.whole_number(name, "length", length)
-    )
+    episodes, top = require_counts(name, episodes=episodes, top=top)
+    if length is None:
+        length = max(1, -(-sim.horizon // 8))
+    length = min(_checks.whole_number(name, "length", length), sim.horizon)
     expected = "from 0 to below 1"
     backward = _checks.number(name, "backward", backward, lambda v: 0 <= v < 1, expected)
     if cell is not None and not callable(cell):
         raise ValueError(f"{name}: cell must be a function of a state, received {cell!r}"[:200])
-    _checks.check_random_key(name, key)
-    if is_traced(key, sim) or is_tracing():
-        raise ValueError(f"{name}: cannot be traced; call it outside of jax.jit and jax.vmap")
+    require_host(name, key, sim)
     contract(name, sim)
-    cell = None if cell is None else _cell(name, sim, cell)
-    numbers = dict(episodes=episodes, length=min(length, sim.horizon), backward=backward)
-    settings = planned(name, refine, sim, call_settings(name, key, **numbers), SHARE)
-    size = HOSTED if runs_on_host(sim) else LANES
-    lanes = max(8, min(size, 1 << max(0, (episodes // 16).bit_length())))
-    plan = P.Plan(lanes, min(length, sim.horizon), min(TRACES, lanes // 8))
-    search = _Search(key, sim, cell, plan, episodes, int(episodes * (1 - backward)))
-    before = incidents(sim)
-    mark = jax.eval_shape(partial(C.features, sim), outline(sim).state)
+    given = dict(episodes=episodes, length=length, backward=backward)
+    settings = with_refine_share(name, refine, sim, call_settings(name, key, **given), SHARE)
+    most = HOSTED_LANES if runs_on_host(sim) else LANES
+    lanes = max(8, min(most, 1 << max(0, (episodes // 16).bit_length())))
     slots = min(SLOTS, max(64, 4 * episodes))
-    needed = 2 * memory.size(jax.eval_shape(partial(C.empty, sim, slots)))  # and those that enter
+    # twice: with those that enter
+    needed = 2 * memory.size(jax.eval_shape(partial(empty_cells, sim, slots)))
     memory.require(name, needed, f"{slots} states and the ways there", "use a smaller state")
-    carry = C.empty(sim, slots), K.none(sim, max(top, 64), mark), None, 0
     stretch = lanes if runs_on_host(sim) else lanes * max(1, episodes // (lanes * MOMENTS))
-    ends = [*range(stretch, episodes, stretch), episodes]
-    (_, kept, *_), log = E.drive(
-        search.chunk,
-        carry,
-        ends,
-        host=runs_on_host(sim),
+    return run(
+        key,
+        _Search(
+            sim=sim,
+            reward=standard_reward(sim),
+            top=top,
+            key=tree_keys(key, 1)[0],
+            cell=None if cell is None else _cell(name, sim, cell),
+            plan=Plan(lanes, length, min(TRACES, lanes // 8)),
+            slots=slots,
+            episodes=episodes,
+            until=int(episodes * (1 - backward)),
+        ),
+        [*range(stretch, episodes, stretch), episodes],
+        settings,
         progress=progress,
         callback=callback,
-        name=name,
+        checkpoint=checkpoint,
+        cell=cell,
     )
-    found = K.result(sim, search.reward, log, kept, settings, top)
-    found = ended(key, sim, search.reward, found, top)
-    return found._replace(incidents=new_incidents(before, incidents(sim)))
 
 
 def _cell(name, sim, cell):
@@ -165,39 +184,48 @@ def _cell(name, sim, cell):
     return as_pytree(cell)
 
 
+@dataclass(frozen=True)
 class _Search:
-    """What does not change while a search runs."""
+    """A `jast.search.driver.Search`."""
 
-    def __init__(self, key, sim, cell, plan, episodes, until):
-        self.key, self.rng = tree_keys(key, 1)[0], numpy_generator(jax.random.fold_in(key, 1))
-        self.sim, self.cell, self.plan, self.reward = sim, cell, plan, K.likelihood(sim)
-        self.episodes, self.until = episodes, until
+    sim: Simulator
+    reward: Any
+    top: int
+    key: jax.Array
+    cell: Callable | None
+    plan: Plan
+    slots: int
+    episodes: int
+    until: int
+    """Runs that explore, at least."""
 
-    def chunk(self, carry, begin, end):
-        """Runs ``begin`` .. ``end - 1``: explore, or, where a failure is known and it is time for
-        that, make failures likelier.
-        """
-        cells, kept, traces, since = carry
-        ends = np.int32(begin), np.int32(end)
-        if traces is None and begin >= self.until and np.asarray(kept.episode.failure)[0]:
-            traces, since = self._traces(kept), begin
-        if traces is None:
-            (cells, kept), counted = P.explore(
-                self.key, self.sim, self.reward, self.cell, self.plan, cells, kept, *ends
-            )
+    def init(self) -> State:
+        sim, n = self.sim, self.plan.traces
+        mark = jax.eval_shape(partial(features, sim), outline(sim).state)
+        best = BestEpisodes.none(sim, max(self.top, 64), mark)
+        return State(empty_cells(sim, self.slots), best, _traces(blank_episodes(sim, n)), -1)
+
+    def step(self, state: State, begin: int, end: int) -> tuple[State, Tally, jax.Array, None]:
+        """Explore, or, where a failure is known and it is time for that, make failures likelier."""
+        cells, best, traces, since = state
+        common, ends = (self.key, self.sim, self.reward), (np.int32(begin), np.int32(end))
+        if since < 0 and begin >= self.until and np.asarray(best.episode.failure)[0]:
+            traces, since = self.first_traces(best), begin
+        if since < 0:
+            (cells, best), tally = explore(*common, self.cell, self.plan, cells, best, *ends)
         else:
             whole = max(1.0, BACK * (self.episodes - since))
-            schedule = np.array([since, whole], kept.value.dtype)
-            (kept, traces), counted = P.backward(
-                self.key, self.sim, self.reward, self.plan, kept, traces, *ends, *schedule
+            schedule = np.array([since, whole], best.value.dtype)
+            (best, traces), tally = improve_backward(
+                *common, self.plan, best, traces, *ends, *schedule
             )
-        return (cells, kept, traces, since), counted, K.best_of(kept), None
+        return State(cells, best, traces, since), tally, best.reward(), None
 
-    def _traces(self, kept):
+    def first_traces(self, best: BestEpisodes) -> Traces:
         """The likeliest failure, then by turns the one that ends least like those and the next
         likeliest.
         """
-        e, value, mark = jax.device_get((kept.episode, kept.value, kept.mark))
+        e, value, mark = jax.device_get((best.episode, best.value, best.mark))
         n = int((e.failure & (value > -np.inf)).sum())
         mark = (mark[:n] - mark[:n].mean(axis=0)) / np.maximum(mark[:n].std(axis=0), 1e-6)
         rows, left = [0], list(range(1, n))
@@ -205,5 +233,11 @@ class _Search:
             far = np.abs(mark[left][:, None] - mark[rows][None]).sum(axis=2).min(axis=1)
             rows.append(left.pop(int(np.argmax(far)) if len(rows) % 2 else 0))
         rows = np.resize(rows, self.plan.traces)
-        e = jax.tree.map(lambda a: a[rows], e)
-        return P.Traces(e.x0, e.disturbances, e.length, e.reward)
+        return _traces(jax.tree.map(lambda a: a[rows], e))
+
+    def result(self, state: State, log: Log, settings: dict[str, Any]) -> SearchResult:
+        return state.best.result(self, log, settings)
+
+
+def _traces(e: Episode) -> Traces:
+    return Traces(e.x0, e.disturbances, e.length, e.reward)

@@ -5,37 +5,36 @@ the likeliest failures (`jast.boundary`, `jast.search.refine`).
 from __future__ import annotations
 
 from functools import partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import numpy as np
 
-from jast import _checks
-from jast import boundary as B
-from jast._jax import is_traced, is_tracing, jit
+from jast._jax import jit
+from jast.boundary import EPISODES, STEPS, descents
 from jast.episode import Episode, play_back
 from jast.incidents import runs_on_host
 from jast.limit_state import check, dimension, normal_numbers, played, side_by_side
 from jast.results import call_settings
-from jast.search import kept as K
-from jast.search import lockstep as E
-from jast.search.ending import ended, planned
+from jast.search.driver import Log, finish, require_counts, require_host, run
+from jast.search.ending import with_refine_share
+from jast.search.kept import standard_reward
+from jast.search.lockstep import NEVER, Tally, blank_episodes
+from jast.search.refinement import GRADIENT, first_failing_lift, lift
 from jast.search.result import SearchResult
 from jast.simulator import Simulator
 
 if TYPE_CHECKING:
     import chex
 
-    from jast.typing import Callback
+    from jast.typing import Callback, PathLike
 
 __all__ = ["gradient"]
 
-GRADIENT = 4
-"""Evaluations that one with its gradient is counted as."""
 SHARE = 2.0
 """Of the evaluations, for the refinement: descents are few, and end anywhere on the boundary."""
-LIFTS = 0.0, 1e-6, 1e-5, 1e-4, 1e-3
-"""How much farther out a point may be taken that is on the knife edge."""
+EVALUATIONS = STEPS * GRADIENT + EPISODES
+"""Of one descent."""
 
 
 def gradient(
@@ -47,6 +46,7 @@ def gradient(
     top: int = 64,
     progress: bool = False,
     callback: Callback | None = None,
+    checkpoint: PathLike | None = None,
 ) -> SearchResult:
     """Follow the gradient of the miss distance to failures, and make them as likely as they get.
 
@@ -63,6 +63,8 @@ def gradient(
         top: distinct failures kept.
         progress: show a bar.
         callback: called as ``callback(done, total, None)``, in evaluations, after the descents.
+        checkpoint: a folder that keeps what the descents and the refinement came to. The same call
+            then goes on where it was stopped, to the same result.
 
     Returns:
         `SearchResult`: the ends of the descents, and what came of them (``refined``). Its reward is
@@ -85,99 +87,95 @@ def gradient(
         True
     """
     name = "gradient"
-    starts, top = E.whole(name, starts=starts, top=top)
-    _checks.check_random_key(name, key)
-    if is_traced(key, sim) or is_tracing():
-        raise ValueError(f"{name}: cannot be traced; call it outside of jax.jit and jax.vmap")
+    starts, top = require_counts(name, starts=starts, top=top)
+    require_host(name, key, sim)
     if runs_on_host(sim):
         raise ValueError(
             f"{name}: sim runs on the host and has no gradients; jast.search.go_explore and"
             " jast.search.chain need none"
         )
     check(name, sim)
-    search = _Search(key, sim, starts, top)
-    settings = planned(name, refine, sim, call_settings(name, key, starts=starts), SHARE)
-    cost = starts * (B.STEPS * GRADIENT + B.EPISODES)
-    found, log = E.drive(
-        search.chunk,
-        (None, None, 0.0),
-        [cost],
+    settings = with_refine_share(name, refine, sim, call_settings(name, key, starts=starts), SHARE)
+    return run(
+        key,
+        _Search(key, sim, starts, top),
+        [starts * EVALUATIONS],
+        settings,
         progress=progress,
         callback=callback,
-        name=name,
+        checkpoint=checkpoint,
     )
-    found = search.result(found, log, settings | dict(useful_gradients=round(found[2], 4)))
-    return ended(key, sim, search.reward, found, top)
+
+
+class State(NamedTuple):
+    """What the descents came to."""
+
+    failing: Episode
+    """[m] the failing episodes at their ends."""
+    nearest: Episode
+    """[1] that of the least distance."""
+    useful: float
+    """Share of the gradients that were finite and not 0."""
 
 
 class _Search:
-    """What does not change while a search runs."""
+    """A `jast.search.driver.Search` of one step."""
 
-    def __init__(self, key, sim, starts, top):
-        self.sim, self.reward, self.starts, self.top = sim, K.likelihood(sim), starts, top
+    def __init__(self, key: jax.Array, sim: Simulator, starts: int, top: int):
+        self.sim, self.reward, self.top = sim, standard_reward(sim), top
         self.draw, _ = jax.random.split(key)
+        self.starts = starts
 
-    def chunk(self, *_):
-        """The descents: ((failing episodes, the nearest one, share of useful gradients), `E.Tally`,
-        best reward, None).
-        """
+    def init(self) -> State:
+        return State(blank_episodes(self.sim, 0), blank_episodes(self.sim, 1), 0.0)
+
+    def step(self, state: State, begin: int, end: int) -> tuple[State, Tally, np.ndarray, None]:
+        """The descents."""
         sim, n = self.sim, self.starts
         z = jax.random.normal(self.draw, (n, dimension(sim)), normal_numbers(sim))
-        d = jax.device_get(B.descents(sim, z))
-        ends = np.where(np.isfinite(d.point).all(axis=1) & d.found)[0]
-        failing = self._failing(d.point[ends])
-        i = int(np.argmin(d.distance))
-        nearest = jax.tree.map(lambda a: a[0], played(sim, d.nearest[i][None]))
+        d = jax.device_get(descents(sim, z))
+        failing = self._failing(d.point[np.isfinite(d.point).all(axis=1) & d.found])
+        nearest = played(sim, d.nearest[[np.argmin(d.distance)]])
         first = int(d.first.min())
         # side by side, the gradients of a step before its other episodes
-        order = (first * (GRADIENT * n + n * (B.EPISODES // B.STEPS))) + GRADIENT * n
-        order += int(np.argmin(d.first)) + 1
-        counted = self._tally(
-            n * (B.STEPS * GRADIENT + B.EPISODES),
-            GRADIENT * int(d.slopes.sum()) + int(d.steps.sum()),
-            int(d.failing.sum()),
-            int(d.invalid.sum()),
-            order if first < B.STEPS else None,
+        order = first * (GRADIENT * n + n * (EPISODES // STEPS)) + GRADIENT * n
+        failures = int(d.failing.sum())
+        tally = Tally(
+            episodes=end,
+            steps=GRADIENT * int(d.slopes.sum()) + int(d.steps.sum()),
+            failures=failures,
+            invalid=int(d.invalid.sum()),
+            first=order + int(np.argmin(d.first)) + 1 if first < STEPS else NEVER,
+            failing=np.array([failures > 0]),
         )
-        found = failing, nearest, float(d.useful.sum()) / (n * B.STEPS)
-        return found, counted, self._best(found), None
+        best = failing.reward.max() if len(failing.length) else nearest.reward[0]
+        useful = float(d.useful.sum()) / (n * STEPS)
+        return State(failing, nearest, useful), tally, np.array([best]), None
 
-    def _failing(self, z):
+    def _failing(self, z: np.ndarray) -> Episode:
         """The failing episodes of the points ``z`` [n, D], lifted as little as makes them fail;
-        None where there is none.
+        their reward is log p relative to the mode.
         """
-        if not len(z):
-            return None
-        lifted = z[None] * (1 + np.array(LIFTS, z.dtype))[:, None, None]
-        e = played(self.sim, lifted.reshape(-1, z.shape[1]))
-        fails = e.failure.reshape(len(LIFTS), -1)
-        rows = (np.argmax(fails, axis=0) * len(z) + np.arange(len(z)))[fails.any(axis=0)]
-        return self._scored(jax.tree.map(lambda a: a[rows], e)) if len(rows) else None
+        sim = self.sim
+        if len(z):
+            e = played(sim, lift(z).reshape(-1, dimension(sim)))
+            _, rows = first_failing_lift(e.failure, len(z))
+            if len(rows):
+                e = jax.tree.map(lambda a: a[rows], e)
+                return side_by_side(sim, partial(_scored, sim, self.reward), e)
+        return jax.device_get(blank_episodes(sim, 0))
 
-    def _scored(self, e):
-        """The episodes, with log p relative to the mode as their reward."""
-        return side_by_side(self.sim, partial(_scored, self.sim, self.reward), e)
-
-    def _best(self, found):
-        failing, nearest, _ = found
-        return np.array([nearest.reward if failing is None else failing.reward.max()])
-
-    def _tally(self, episodes, steps, failures, invalid, first):
-        number = E.NEVER if first is None else first
-        return E.Tally(episodes, steps, failures, invalid, number, np.array([failures > 0]))
-
-    def result(self, found, log, settings):
-        failing, nearest, _ = found
-        none = jax.tree.map(lambda a: np.asarray(a)[None][:0], nearest)
-        e = none if failing is None else failing
-        n = len(e.length)
-        numbers = np.arange(n), np.ones(n, np.int32)
-        return E.finish(
-            self.sim, self.reward, log, nearest, e, [0] * n, *numbers, settings, self.top
-        )
+    def result(self, state: State, log: Log, settings: dict[str, Any]) -> SearchResult:
+        failing, n = state.failing, len(state.failing.length)
+        once = np.ones(n, np.int32)
+        nearest = jax.tree.map(lambda a: a[0], state.nearest)
+        settings = settings | dict(useful_gradients=round(float(state.useful), 4))
+        return finish(self, log, nearest, failing, np.arange(n), counts=once, settings=settings)
 
 
 @jit
-def _scored(sim, reward, e: Episode) -> Episode:
-    play = lambda x0, x, n: play_back(sim, reward, x0, x, n)._replace(states=None)
-    return jax.vmap(play)(e.x0, e.disturbances, e.length)
+def _scored(sim: Simulator, reward: Any, e: Episode) -> Episode:
+    def score(x0, x, length):
+        return play_back(sim, reward, x0, x, length)._replace(states=None)
+
+    return jax.vmap(score)(e.x0, e.disturbances, e.length)

@@ -19,68 +19,136 @@ Sizes of steps grow where they pay and shrink where they do not, for each point 
 All of it is NumPy's, for n points at a time: there is nothing to compile.
 """
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-__all__ = ["Noise", "Point", "along", "around", "resized", "SIZE"]
+__all__ = [
+    "ENTRANTS",
+    "EXCHANGES",
+    "NEAREST",
+    "RAYS",
+    "REMOVALS",
+    "SHIFTS",
+    "SIZE",
+    "WALKS",
+    "Noise",
+    "Point",
+    "boundary_direction",
+    "candidates",
+    "draw_noise",
+    "resize_steps",
+]
 
-RAYS, LENGTHS, LIFTS, WALKS, REMOVALS, EXCHANGES, SHIFTS = 6, 3, 4, 8, 6, 8, 4
-KINDS = RAYS, LENGTHS * LIFTS, WALKS + 1, REMOVALS, EXCHANGES, SHIFTS
-SIZE = sum(KINDS)
-"""Candidates of a point in a round."""
-NEAREST, FARTHEST = 1e-6, 0.5
-"""The least and the largest gap."""
-ENTRANTS = 4
-"""Numbers among which an exchange takes the dearest, or the cheapest."""
-SHARES = 8, 4, 2, 1, 0.5, 0.25
-STRETCHES = 2.5, 1, 0.4
-"""Rays, as shares of the gap; slopes, as shares of the length."""
+RAY_LENGTHS = 8, 4, 2, 1, 0.5, 0.25
+"""Of the rays, as shares of the gap."""
+SLOPE_LENGTHS = 2.5, 1, 0.4
+"""Of the steps along the boundary, as shares of the length."""
 RAISED = 0, 0.1, 0.3, 0.6
-"""How far a step along the boundary is lifted for one that bends, as shares of its angle."""
+"""How far each of them is lifted for a boundary that bends, as shares of the angle of the step."""
 WIDTHS = 3, 1, 0.3, 0.1, 3, 1, 0.3, 0.1
 """Of the walks, as shares of the width."""
+RAYS = len(RAY_LENGTHS)
+"""Candidates of a point in a round that are rays; likewise"""
+SLOPES = len(SLOPE_LENGTHS) * len(RAISED)
+"""steps along the boundary,"""
+WALKS = len(WIDTHS)
+"""walks (beside the last step that paid),"""
+REMOVALS = 6
+"""removals,"""
+EXCHANGES = 8
+"""exchanges,"""
+SHIFTS = 4
+"""and shifts in time."""
+SIZE = RAYS + SLOPES + WALKS + 1 + REMOVALS + EXCHANGES + SHIFTS
+"""Candidates of a point in a round."""
+NEAREST = 1e-6
+"""The least gap, and the least of what is divided by."""
+FARTHEST = 0.5
+"""The largest gap."""
+MIN_STEP = 1e-3
+"""The least length and width."""
+ENTRANTS = 4
+"""Numbers among which an exchange takes the dearest, or the cheapest."""
 
 
 class Point(NamedTuple):
     """Failing points [n] on their way, and the sizes of their steps."""
 
-    v: Any
+    v: np.ndarray
     """[n, D]"""
-    cost: Any
-    used: Any
-    gap: Any
-    """How far inside the failures it may be, as a share of its way from the origin"""
-    length: Any
-    """Of steps along the boundary; 1: to where the linearised problem has its optimum"""
-    width: Any
-    """Of random steps, as a share of the distance from the origin"""
-    last: Any
-    """[n, D] the last step that paid"""
-    slope: Any
+    cost: np.ndarray
+    used: np.ndarray
+    """How many of the numbers decide something."""
+    gap: np.ndarray
+    """How far inside the failures it may be, as a share of its way from the origin."""
+    length: np.ndarray
+    """Of steps along the boundary; 1: to where the linearised problem has its optimum."""
+    width: np.ndarray
+    """Of random steps, as a share of the distance from the origin."""
+    last: np.ndarray
+    """[n, D] the last step that paid."""
+    slope: np.ndarray
     """[n, D] of the distance, and"""
-    rise: Any
-    """[n, D] of the cost, both at the last round"""
+    rise: np.ndarray
+    """[n, D] of the cost, both at the last round."""
 
 
 class Noise(NamedTuple):
-    """Random numbers of a round, for each of n points: `walks` [n, WALKS, D] normal; uniform
-    `masks` [n, REMOVALS, D], `rates` and `shrinks` [n, REMOVALS], `pairs` [n, EXCHANGES, 2,
-    ENTRANTS] and `sizes` [n, EXCHANGES]; `shifts` [n, SHIFTS] int32, steps, with normal `fills` [n,
-    SHIFTS].
-    """
+    """Random numbers of a round, for each of n points."""
 
-    walks: Any
-    masks: Any
-    rates: Any
-    shrinks: Any
-    pairs: Any
-    sizes: Any
-    shifts: Any
-    fills: Any
+    walks: np.ndarray
+    """[n, WALKS, D] normal"""
+    masks: np.ndarray
+    """[n, REMOVALS, D] uniform"""
+    rates: np.ndarray
+    """[n, REMOVALS]"""
+    shrinks: np.ndarray
+    """[n, REMOVALS] powers of ten"""
+    pairs: np.ndarray
+    """[n, EXCHANGES, 2, ENTRANTS] uniform"""
+    sizes: np.ndarray
+    """[n, EXCHANGES] powers of ten"""
+    shifts: np.ndarray
+    """[n, SHIFTS] int32: steps"""
+    fills: np.ndarray
+    """[n, SHIFTS] normal"""
 
 
-def around(point: Point, noise: Noise, first: int, horizon: int) -> np.ndarray:
+def draw_noise(rng: np.random.Generator, v: np.ndarray, horizon: int) -> Noise:
+    """The `Noise` of a round for the points ``v`` [n, D]."""
+    (n, d), real = v.shape, v.dtype
+
+    def uniform(*shape):
+        return rng.random((n, *shape)).astype(real)
+
+    def normal(*shape):
+        return rng.standard_normal((n, *shape)).astype(real)
+
+    def powers(k):
+        return (10.0 ** -rng.integers(0, 5, (n, k))).astype(real)
+
+    return Noise(
+        walks=normal(WALKS, d),
+        masks=uniform(REMOVALS, d),
+        rates=uniform(REMOVALS) ** 2,
+        shrinks=powers(REMOVALS),
+        pairs=uniform(EXCHANGES, 2, ENTRANTS),
+        sizes=powers(EXCHANGES),
+        shifts=_draw_shifts(rng, n, horizon),
+        fills=normal(SHIFTS),
+    )
+
+
+def _draw_shifts(rng, n, horizon):
+    """One step later, twice, as more steps are more ways; one sooner; many, either way."""
+    far = rng.integers(2, max(3, horizon // 3), n) * rng.choice([-1, 1], n)
+    steps = np.stack([np.ones(n), np.ones(n), -np.ones(n), far], axis=1)
+    most = horizon - 1  # one of the steps at least stays
+    return np.clip(steps, -most, most).astype(np.int32)
+
+
+def candidates(point: Point, noise: Noise, first: int, horizon: int) -> np.ndarray:
     """The candidates [n, SIZE, D] around the points; slope and rise are 0 where they are not
     known. ``first``: how many of the D numbers are of the start; the others are of ``horizon``
     steps.
@@ -98,28 +166,33 @@ def around(point: Point, noise: Noise, first: int, horizon: int) -> np.ndarray:
     )
 
 
-def resized(point: Point, i: np.ndarray, better: np.ndarray, failing: np.ndarray) -> Point:
+def resize_steps(point: Point, i: np.ndarray, better: np.ndarray, failing: np.ndarray) -> Point:
     """The points with the sizes of their steps after candidates ``i`` [n] were the best of the
     round; ``failing`` [n, RAYS]: which rays failed.
     """
-    rays, slopes, walks = (sum(KINDS[:k]) for k in (1, 2, 3))
-    took = lambda low, high: better & (i >= low) & (i < high)
-    shares, lengths, widths = _of(point, SHARES), _lengths(point), _widths(point)
-    at = lambda a, k: np.take_along_axis(a, np.clip(k, 0, a.shape[1] - 1)[:, None], axis=1)[:, 0]
+    rays, slopes, walks = RAYS, RAYS + SLOPES, RAYS + SLOPES + WALKS
+    by_slope, by_walk = (i >= rays) & (i < slopes), (i >= slopes) & (i < walks)
+    shares = _of(point, RAY_LENGTHS)
     paid = shares[np.minimum(i, rays - 1)]
     missed = np.where(failing, 2 * shares[0], shares).min(axis=1)
     gap = point.gap * np.where(better, 2 * missed, 0.25)
-    gap = np.where(took(0, rays), point.gap * np.where(paid <= 1, 0.5, paid), gap)
+    gap = np.where(better & (i < rays), point.gap * np.where(paid <= 1, 0.5, paid), gap)
     length = point.length * np.where(better, 1, 0.5)
-    length = np.where(took(rays, slopes), at(lengths, (i - rays) // LIFTS), length)
-    width = point.width * 0.93
-    width = np.where(took(slopes, walks - 1), 1.5 * at(widths, i - slopes), width)
+    of_slope = _entry(_lengths(point), (i - rays) // len(RAISED))
+    length = np.where(better & by_slope, of_slope, length)
+    width = np.where(better & by_walk, 1.5 * _entry(_widths(point), i - slopes), 0.93 * point.width)
     dtype = point.v.dtype
     return point._replace(
         gap=np.clip(gap, NEAREST, FARTHEST).astype(dtype),
-        length=np.clip(length, 1e-3, 1).astype(dtype),
-        width=np.clip(width, 1e-3, 1).astype(dtype),
+        length=np.clip(length, MIN_STEP, 1).astype(dtype),
+        width=np.clip(width, MIN_STEP, 1).astype(dtype),
     )
+
+
+def _entry(a, k):
+    """The entry ``k`` [n] of each row of ``a`` [n, m]; the nearest where there is none such."""
+    k = np.clip(k, 0, a.shape[1] - 1)[:, None]
+    return np.take_along_axis(a, k, axis=1)[:, 0]
 
 
 def _of(point, numbers):
@@ -127,7 +200,7 @@ def _of(point, numbers):
 
 
 def _lengths(point):
-    return np.minimum(point.length[:, None] * _of(point, STRETCHES), 1.5)
+    return np.minimum(point.length[:, None] * _of(point, SLOPE_LENGTHS), 1.5)
 
 
 def _widths(point):
@@ -146,7 +219,7 @@ def _norm(a):
 
 
 def _rays(point):
-    drawn = 1 - np.minimum(_of(point, SHARES) * point.gap[:, None], 1)
+    drawn = 1 - np.minimum(_of(point, RAY_LENGTHS) * point.gap[:, None], 1)
     return point.v[:, None] * drawn[:, :, None]
 
 
@@ -155,7 +228,7 @@ def _slid(point):
     0 to the side where the distance grows.
     """
     v, slope = point.v[:, None], point.slope[:, None]
-    lengths, way = _lengths(point), along(point)
+    lengths, way = _lengths(point), boundary_direction(point)
     bend = (way**2).sum(axis=1) / np.maximum(_norm(point.v)[:, 0], NEAREST) ** 2
     angle = np.minimum(lengths * bend[:, None], 1)
     lifts = 1e-5 + _of(point, RAISED) * angle[:, :, None]
@@ -179,16 +252,16 @@ def _walked(point, normals):
     return walks * (radius * drop[:, :, None] / np.maximum(_norm(walks), NEAREST))
 
 
-def along(point: Point) -> np.ndarray:
+def boundary_direction(point: Point) -> np.ndarray:
     """The way along the boundary that lowers the cost [n, D]. A number at 0 leaves it for the side
     where the distance falls or not at all: the other is dearer and of no use.
     """
     side = _helpful(point.slope)
     size, rise, free = np.abs(point.slope), side * point.rise, np.ones(point.v.shape, bool)
-    total = lambda a: np.where(free, a, 0).sum(axis=1, keepdims=True)
     for _ in range(3):
-        square = total(size**2)
-        price = total(size * rise) / np.where(square > 0, square, 1)
+        square = np.where(free, size**2, 0).sum(axis=1, keepdims=True)
+        price = np.where(free, size * rise, 0).sum(axis=1, keepdims=True)
+        price = price / np.where(square > 0, square, 1)
         way = np.where(free, price * size - rise, 0)
         free &= (point.v != 0) | (way > 0)
     return np.where(free, side * way, 0)
@@ -216,11 +289,11 @@ def _exchanged(point, noise):
     dear = np.where(v * slope < 0, -price, np.inf)
     lowered = _picked(live & (v != 0), noise.pairs[:, :, 0], dear)
     raised = _picked(live & (slope != 0), noise.pairs[:, :, 1], price)
-    of = lambda a, k: np.take_along_axis(a, k, axis=1)
-    drop = noise.sizes * of(v, lowered)
+    row = np.arange(len(v))[:, None]
+    drop = noise.sizes * v[row, lowered]
     # by a little more than to first order, for a boundary that bends
-    back = drop * (1 + 0.1 * noise.sizes) * of(slope, lowered) / of(steep, raised)
-    back = np.where((raised != lowered) & (of(slope, raised) != 0) & np.isfinite(back), back, 0)
+    back = drop * (1 + 0.1 * noise.sizes) * slope[row, lowered] / steep[row, raised]
+    back = np.where((raised != lowered) & (slope[row, raised] != 0) & np.isfinite(back), back, 0)
     moved = v[:, None].repeat(drop.shape[1], axis=1)
     n, e = np.indices(drop.shape)
     moved[n, e, lowered] -= drop

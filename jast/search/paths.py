@@ -10,30 +10,46 @@ from jast.outline import outline
 from jast.pytrees import count_numbers
 from jast.simulator import Simulator
 
-__all__ = ["Paths", "assigned", "components", "moved_in_time", "nearest"]
+__all__ = [
+    "ALIKE",
+    "Paths",
+    "assigned",
+    "components",
+    "distinct_points",
+    "moved_in_time",
+    "nearest",
+]
 
 PLACES = 7
-LIFTS, OPPOSITE, ALIKE = (1.0, 1.03, 1.06, 1.1), -0.5, 0.8
-"""Points of a path between two failures, and how much farther out than the line between the two a
-path may run: "by much" is a tenth of the way from the origin. The least cosine between the two; the
-least of those that are alike.
-"""
+"""Points of a path between two failures, at first."""
+LIFTS = 1.0, 1.03, 1.06, 1.1
+"""How much farther out than the line between the two a path may run: a tenth of the way from the
+origin, at most."""
+OPPOSITE = -0.5
+"""The cosine of two failures below which no path is looked for."""
+ALIKE = 0.8
+"""The cosine from which two are alike, where nothing can be simulated."""
 FINE = 0.1
 """Angle, in radians, between two places of a path that is believed: between the two sides of
 README's lane there is one with eight gaps of .12, of which one holds no failure."""
 RARER = 1.0
 """By how many nats one on the way between two modes may be rarer than the rarer of the two."""
-BENT, MOVES, TRIALS = 0.1, 2, 8
-"""How far beside the line a path may bend, as a share of the way from the origin; in how many
-moves, each the best of so many trials. Of the failures of the ferry straight paths make 10, 13 and
+BENT = 0.1
+"""How far beside the line a path may bend, as a share of the way from the origin."""
+MOVES = 2
+"""In which it does."""
+TRIALS = 8
+"""Each the best of so many. Of the failures of the ferry straight paths make 10, 13 and
 11 modes (three keys, 6,000 evaluations at most) and these one (14,300 at most); of the ship's 12
 and 7 (within 12,500: 7, 8 with four moves, 9 with one move or six trials). The two of the lane and
 of the arm, four branches and the 14 found of "2 of 10" and of "series 60, turned" stay apart.
 """
-PAIRS, LEAST, IN_VAIN = 32, 2, 4
-"""Paths looked for at a time, of all modes together and at least of each; times in a row in which
-others join no two modes, after which it is enough.
-"""
+PAIRS = 32
+"""Paths looked for at a time, of all modes."""
+MIN_PAIRS = 2
+"""Of each mode, at least."""
+IN_VAIN = 4
+"""Times in a row in which paths by way of others join no two modes, after which it is enough."""
 
 
 def components(
@@ -112,7 +128,7 @@ def _nearest_pairs(cosine, open, owner, tops):
     """Of each of the components ``tops`` those of the pairs ``open`` [N, N] that are nearest in
     direction: [m, 2], the nearest first.
     """
-    found, each = set(), max(LEAST, PAIRS // len(tops))
+    found, each = set(), max(MIN_PAIRS, PAIRS // len(tops))
     for k in tops:
         mine = np.flatnonzero(owner == k)
         worth = np.where(open[mine], cosine[mine], -np.inf)
@@ -139,6 +155,25 @@ def assigned(paths, many, known, owner):
         out[rows[joined]] = owner[order[rows[joined], k]]
         left[rows[joined]] = False
     return out
+
+
+def distinct_points(
+    v: np.ndarray, *, distance: float | None = None, cosine: float | None = None
+) -> list[int]:
+    """Which of the points ``v`` [n, D] are the same as none of those before them: [m]. The same are
+    two that are no farther from one another than ``distance`` times the second one's way from the
+    origin, or whose directions have at least this ``cosine``.
+    """
+    chosen = []
+    for i, point in enumerate(v):
+        if distance is not None:
+            size = distance * max(float(np.linalg.norm(point)), 1e-12)
+            same = np.linalg.norm(v[chosen] - point, axis=1) <= size
+        else:
+            same = unit(v[chosen]) @ unit(point) >= cosine
+        if not same.any():
+            chosen.append(i)
+    return chosen
 
 
 def nearest(w, v):
@@ -261,4 +296,4 @@ def _arcs(v, w, t):
     norm, t = partial(np.linalg.norm, axis=-1, keepdims=True), t[:, None, None]
     line = (1 - t) * unit(v) + t * unit(w)
     size = (1 - t) * norm(v) + t * norm(w)
-    return np.where(norm(line) > 1e-3, unit(line) * size, 0)
+    return np.where(norm(line) > 1e-3, unit(line) * size, 0)  # opposite points have no arc

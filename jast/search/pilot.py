@@ -14,46 +14,51 @@ import numpy as np
 from jax import lax
 
 from jast import actions as choices
-from jast import failures as archive
 from jast._jax import is_tracing, jit
 from jast._threads import run_in_thread
 from jast.counter import tree_keys
 from jast.episode import Episode, play_back
+from jast.failures import collect, merge
 from jast.incidents import runs_on_host
 from jast.outline import outline
 from jast.rewards import LogLikelihood
-from jast.search import lockstep as E
+from jast.search.lockstep import NEVER, Played, Tally, blank_episodes, play_lanes
 from jast.search.result import SearchResult
 from jast.simulator import Simulator
 
-__all__ = ["Pilot", "fly", "joined"]
+__all__ = ["Calibration", "calibrate", "with_calibration"]
 
-EPISODES, HOSTED = 128, 10
-"""Of a batch; of a system on the host, where episodes are dear."""
-WIDTHS, FAILING, NEAREST = (1.0, 1.5, 2.0, 3.0, 4.0, 6.0), 0.01, 0.1
-"""The widths that are tried; the share that is to fail, from which a search goes on (more noise
-found less likely failures); the share of episodes that are near.
-"""
+EPISODES = 128
+"""Of a batch."""
+HOSTED_EPISODES = 10
+"""Of a batch of a system on the host, where episodes are dear."""
+WIDTHS = 1.0, 1.5, 2.0, 3.0, 4.0, 6.0
+"""That are tried, in this order."""
+FAILING_SHARE = 0.01
+"""From which no wider noise is tried: more noise found less likely failures."""
+NEAR_SHARE = 0.1
+"""Of the episodes: where none fails, that width is taken of which these come nearest."""
 
 
-class Pilot(NamedTuple):
+class Calibration(NamedTuple):
     """What the episodes showed."""
 
-    near: Any
+    near: jax.Array
     """Median of the plain episodes' miss distance, of those above 0; 1 where there is none."""
-    rare: Any
+    rare: jax.Array
     """Median of how far their log p is below ``likely``, of those above 0; 1 where there is
     none.
     """
-    likely: Any
-    width: Any
+    likely: jax.Array
+    """The greatest log p of theirs; 0 where it is relative to the mode."""
+    width: jax.Array
     """For `jast.actions.wide`."""
     episodes: Episode
     """[WIDTHS * EPISODES, ...] all of them; those of widths that were not tried have length 0."""
-    tally: E.Tally
+    tally: Tally
 
 
-def fly(sim: Simulator, density: str, widen: str) -> Pilot:
+def calibrate(sim: Simulator, density: str, widen: str) -> Calibration:
     """Run plain episodes of ``sim``, and wider ones till enough of them fail.
 
     Args:
@@ -62,74 +67,72 @@ def fly(sim: Simulator, density: str, widen: str) -> Pilot:
         widen: "never": the width is 1; "always": till a hundredth fails; "blind": only where
             nothing else points to failures, as all plain episodes have one miss distance.
     """
-    widths = 1 if widen == "never" else len(WIDTHS)
     host = runs_on_host(sim)
-    run = lambda: _fly(sim, density, widths, widen == "blind", HOSTED if host else EPISODES)
+    lanes = HOSTED_EPISODES if host else EPISODES
+    widths = WIDTHS[:1] if widen == "never" else WIDTHS
+
+    work = partial(_calibrated, sim, density, widths, widen == "blind", lanes)
     return (
-        run_in_thread(lambda: jax.block_until_ready(run())) if host and not is_tracing() else run()
+        run_in_thread(lambda: jax.block_until_ready(work()))
+        if host and not is_tracing()
+        else work()
     )
 
 
 @partial(jit, static_argnames=("density", "widths", "blind", "lanes"))
-def _fly(sim: Simulator, density: str, widths: int, blind: bool, lanes: int) -> Pilot:
-    key, like = tree_keys(jax.random.key(0), 1)[0], outline(sim)
-    reward = LogLikelihood(density)
+def _calibrated(
+    sim: Simulator, density: str, widths: tuple[float, ...], blind: bool, lanes: int
+) -> Calibration:
+    key, real = tree_keys(jax.random.key(0), 1)[0], outline(sim).dtype
     live, number = jnp.ones((lanes,), bool), jnp.arange(lanes, dtype=jnp.int32)
-    table = jnp.asarray(WIDTHS[:widths], like.dtype)
+    table, reward = jnp.asarray(widths, real), LogLikelihood(density)
 
-    def batch(i: Any) -> E.Played:
+    def play(i: jax.Array) -> Played:
         keys = jax.vmap(jax.random.fold_in, (None, 0))(key, i * lanes + number)
-        wide = choices.wide(table[i]) if widths > 1 else choices.samples()
-        of = lambda draw: lambda key, row, dist: draw(key, dist)
-        return E.play(sim, reward, keys, of(wide.draw_start), of(wide.draw), live, record=True)
+        drawn = choices.wide(table[i]) if len(widths) > 1 else choices.samples()
+
+        def draw_start(key, row, dist):
+            return drawn.draw_start(key, dist)
+
+        def draw(key, row, dist):
+            return drawn.draw(key, dist)
+
+        return play_lanes(sim, reward, keys, draw_start, draw, live, record=True)
 
     def body(carry: Any) -> Any:
         i, _, shares, nearest, episodes, tally = carry
-        played = batch(i)
+        played = play(i)
         e = played.episode
-        share = jnp.mean(e.failure, dtype=like.dtype)
-        ordered = jnp.sort(jnp.where(e.failure, 0, e.distance))
-        enough = share >= FAILING
+        share = jnp.mean(e.failure, dtype=real)
+        near = jnp.sort(jnp.where(e.failure, 0, e.distance))[int(NEAR_SHARE * (lanes - 1))]
+        enough = share >= FAILING_SHARE
         if blind:
             most = jnp.max(jnp.where(jnp.isfinite(e.distance), e.distance, -jnp.inf))
             enough |= most > jnp.min(jnp.where(e.failure, jnp.inf, e.distance))
-        return (
-            i + 1,
-            enough,
-            shares.at[i].set(share),
-            nearest.at[i].set(ordered[int(NEAREST * (lanes - 1))]),
-            jax.tree.map(
-                lambda all, new: lax.dynamic_update_slice_in_dim(all, new, i * lanes, 0),
-                episodes,
-                e,
-            ),
-            E.add(tally, E.tally(played, live, i * lanes + number)),
-        )
+        put = partial(lax.dynamic_update_slice_in_dim, start_index=i * lanes, axis=0)
+        episodes = jax.tree.map(put, episodes, e)
+        tally = tally.add(Tally.of(played, live, i * lanes + number))
+        return i + 1, enough, shares.at[i].set(share), nearest.at[i].set(near), episodes, tally
 
-    none = jnp.zeros((widths,), like.dtype)
-    start = (
-        jnp.int32(0),
-        jnp.zeros((), bool),
-        none - 1,
-        none + jnp.inf,
-        E.blank(sim, widths * lanes),
-        E.nothing(),
-    )
+    zero, none = jnp.zeros((), jnp.int32), jnp.zeros((len(widths),), real)
+    episodes = blank_episodes(sim, len(widths) * lanes)
     tried, enough, shares, nearest, episodes, tally = lax.while_loop(
-        lambda c: (c[0] < widths) & ~c[1], body, start
+        lambda c: (c[0] < len(widths)) & ~c[1],
+        body,
+        (zero, zero > 0, none - 1, none + jnp.inf, episodes, Tally.none()),
     )
     best = jnp.where(jnp.any(shares > 0), jnp.argmax(shares), jnp.argmin(nearest))
     plain = jax.tree.map(lambda a: a[:lanes], episodes)
     log_p, distance = plain.reward, plain.distance
-    likely = jnp.zeros((), like.dtype) if density == "mode" else jnp.max(log_p)
+    likely = jnp.zeros((), real) if density == "mode" else jnp.max(log_p)
     likely = jnp.where(jnp.isfinite(likely), likely, 0)
-    return Pilot(
-        _median(jnp.where(plain.failure, 0, distance)),
-        _median(jnp.where(jnp.isfinite(log_p), likely - log_p, 0)),
-        likely,
-        table[jnp.where(enough, tried - 1, best.astype(jnp.int32))],
-        episodes,
-        tally,
+    return Calibration(
+        near=_median(jnp.where(plain.failure, 0, distance)),
+        rare=_median(jnp.where(jnp.isfinite(log_p), likely - log_p, 0)),
+        likely=likely,
+        width=table[jnp.where(enough, tried - 1, best.astype(jnp.int32))],
+        episodes=episodes,
+        tally=tally,
     )
 
 
@@ -143,35 +146,32 @@ def _median(values: jax.Array) -> jax.Array:
     return jnp.where(n > 0, middle, 1)
 
 
-def joined(
-    sim: Simulator, reward: Any, pilot: Pilot | None, found: SearchResult, top: int
+def with_calibration(
+    sim: Simulator, reward: Any, calibration: Calibration | None, found: SearchResult, top: int
 ) -> SearchResult:
-    """The `SearchResult` with the pilot's episodes: they stand before all others, and their
-    failures are those of tree -1.
+    """The `SearchResult` with the episodes of the calibration: they stand before all others, and
+    their failures are those of tree -1.
     """
-    if pilot is None:
+    if calibration is None:
         return found
-    n, own = pilot.tally, _best(sim, reward, pilot.episodes)
-    if found.failures is None:  # traced
+    n, e, traced = calibration.tally, calibration.episodes, found.failures is None
+    best = _better(_best(sim, reward, e), found.best)
+    if traced:
         later = jnp.where(found.first_failure < 0, -1, found.first_failure + n.episodes)
-        found = found._replace(
-            first_failure=jnp.where(n.first < E.NEVER, n.first, later),
-            best=_better(own, found.best),
-        )
+        first = jnp.where(n.first < NEVER, n.first, later)
     else:
-        n, own = jax.device_get((n, own))
-        n = E.Tally(*(int(v) for v in n[:5]), n.failing)
+        n, best = jax.device_get((n, best))
+        n = Tally(*(int(v) for v in n[:5]), n.failing)
         later = None if found.first_failure is None else found.first_failure + n.episodes
-        found = found._replace(
-            first_failure=n.first if n.first < E.NEVER else later,
-            best=jax.device_get(_better(own, found.best)),
-        )
-    if found.failures is not None and n.failures:
-        where = np.full(len(pilot.episodes.length), -1, np.int32)
-        more = archive.collect(sim, reward, pilot.episodes, where, seen=n.failures, top=top)
-        found = found._replace(failures=archive.merge(found.failures, more, top=top))
+        first = n.first if n.first < NEVER else later
+    if not traced and n.failures:
+        trees = np.full(len(e.length), -1, np.int32)
+        more = collect(sim, reward, e, trees, seen=n.failures, top=top)
+        found = found._replace(failures=merge(found.failures, more, top=top))
     episodes, failing = found.episodes + n.episodes, found.failing + n.failures
     return found._replace(
+        best=best,
+        first_failure=first,
         episodes=episodes,
         steps=found.steps + n.steps,
         failing=failing,
@@ -181,9 +181,8 @@ def joined(
 
 
 @jax.jit
-def _best(sim: Simulator, reward: Any, episodes: Episode) -> Episode:
-    """The best of the pilot's, likeliest of those that failed or else nearest, as it replays."""
-    e = episodes
+def _best(sim: Simulator, reward: Any, e: Episode) -> Episode:
+    """The best of the episodes, likeliest of those that failed or else nearest, as it replays."""
     score = jnp.where(e.failure, e.reward, -e.distance)
     i = jnp.argmax(jnp.where(e.failure | ~jnp.any(e.failure), score, -jnp.inf))
     x0, x, length = jax.tree.map(lambda a: a[i], (e.x0, e.disturbances, e.length))

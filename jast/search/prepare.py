@@ -14,7 +14,7 @@ from jast._jax import is_traced, is_tracing
 from jast.contract import ACTIONS, contract
 from jast.outline import outline
 from jast.results import call_settings
-from jast.search.pilot import Pilot, fly
+from jast.search.pilot import Calibration, calibrate
 from jast.simulator import Simulator
 
 __all__ = ["Ready", "default_actions", "prepare"]
@@ -28,7 +28,7 @@ class Ready(NamedTuple):
     actions: Any
     settings: dict | None
     """With names and seed; None if traced."""
-    pilot: Pilot | None
+    calibration: Calibration | None
     """The episodes that gave the scales; None where all were given."""
 
 
@@ -51,15 +51,15 @@ def prepare(
     **settings: Any,
 ) -> Ready:
     """The `Ready` of a search by the name ``function``, of its arguments and other ``settings``;
-    ``widen`` of `jast.search.pilot.fly`. ValueError unless `contract` holds.
+    ``widen`` of `jast.search.pilot.calibrate`. ValueError unless `contract` holds.
     """
     check_random_key(function, key)
     contract(function, sim, actions)
     reward = rewards.lexicographic() if reward is None else reward
-    reward, actions, pilot = _scaled(sim, reward, actions, widen)
+    reward, actions, calibration = _scaled(sim, reward, actions, widen)
     reward = rewards.as_pytree(reward)
     if is_traced(key, sim, reward, actions, settings) or is_tracing():
-        return Ready(reward, actions, None, pilot)
+        return Ready(reward, actions, None, calibration)
     func = getattr(reward, "func", reward)
     name = getattr(func, "__name__", None) or f"rewards.{type(func).__name__.lower()}"
     settings = call_settings(function, key, **settings) | dict(
@@ -68,10 +68,12 @@ def prepare(
         actions=ACTIONS.get(type(actions), type(actions).__name__),
         action_settings=_settings(actions),
     )
-    return Ready(reward, actions, settings, pilot)
+    return Ready(reward, actions, settings, calibration)
 
 
-def _scaled(sim: Simulator, reward: Any, actions: Any, widen: str) -> tuple[Any, Any, Pilot | None]:
+def _scaled(
+    sim: Simulator, reward: Any, actions: Any, widen: str
+) -> tuple[Any, Any, Calibration | None]:
     """Reward and actions with the scales that they lack, and the episodes that gave these."""
     bare = isinstance(reward, rewards.Lexicographic) and not reward.scaled
     wide = isinstance(actions, choices.Wide) and actions.width is None
@@ -80,13 +82,13 @@ def _scaled(sim: Simulator, reward: Any, actions: Any, widen: str) -> tuple[Any,
     about, widen = outline(sim), widen if wide else "never"
     given = getattr(reward, "density", None) if bare else "raw"
     density = given or about.density
-    pilot = fly(sim, density, widen)
-    told = pilot.near, pilot.rare, pilot.likely, pilot.width
+    calibration = calibrate(sim, density, widen)
+    told = calibration.near, calibration.rare, calibration.likely, calibration.width
     if not is_traced(told):
-        if given is None and 2 * int(pilot.tally.invalid) > int(pilot.tally.episodes):
+        if given is None and 2 * int(calibration.tally.invalid) > int(calibration.tally.episodes):
             # a mode of infinite density, as of a gamma distribution of shape below 1
-            density, pilot = "raw", fly(sim, "raw", widen)
-            told = pilot.near, pilot.rare, pilot.likely, pilot.width
+            density, calibration = "raw", calibrate(sim, "raw", widen)
+            told = calibration.near, calibration.rare, calibration.likely, calibration.width
         told = [float(v) for v in jax.device_get(told)]
     near, rare, likely, width = told
     if bare:
@@ -97,7 +99,7 @@ def _scaled(sim: Simulator, reward: Any, actions: Any, widen: str) -> tuple[Any,
             likely=likely if reward.rare is None and density == "raw" else reward.likely,
             density=density,
         )
-    return reward, replace(actions, width=width) if wide else actions, pilot
+    return reward, replace(actions, width=width) if wide else actions, calibration
 
 
 def _settings(part: Any) -> dict[str, Any]:

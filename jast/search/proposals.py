@@ -15,13 +15,13 @@ from jast.limit_state import latents
 from jast.outline import outline
 from jast.simulator import Simulator
 
-__all__ = ["around", "copies", "drawer", "kinds"]
+__all__ = ["latents_around", "copy_steps", "make_draw", "proposal_kinds"]
 
 # addresses of an episode's choice of parents, apart from those of its levels
 _CHOICE = np.uint32(1 << 31)
 
 
-def kinds(sim: Simulator, actions: Any) -> tuple[str, str]:
+def proposal_kinds(sim: Simulator, actions: Any) -> tuple[str, str]:
     """How x0 and x are proposed: "latent" where they have a quantile function or a box, else
     "copy".
     """
@@ -32,7 +32,7 @@ def kinds(sim: Simulator, actions: Any) -> tuple[str, str]:
     return "copy", "copy"
 
 
-def copies(key, values, lengths, fresh, part):
+def copy_steps(key, values, lengths, fresh, part):
     """The disturbances [T, ...] that one episode may copy, and whether it does [T].
 
     ``values`` [n, T, ...]: those of n parents, of which ``lengths`` [n] rows count, -1: no parent.
@@ -48,7 +48,7 @@ def copies(key, values, lengths, fresh, part):
     return jax.tree.map(lambda a: a[p, t], values), use
 
 
-def drawer(kind, actions, anew):
+def make_draw(kind, actions, anew):
     """``(key, row, distribution) -> disturbance``, the row being z, or a pair of `copies`;
     ``anew(key, distribution)`` draws where there is nothing to copy.
     """
@@ -63,7 +63,7 @@ def drawer(kind, actions, anew):
     return latent if kind == "latent" else copied
 
 
-def around(sim, actions, failures, settings):
+def latents_around(sim, actions, failures, settings):
     """The latents of the likeliest of ``failures``: leaves [1, ...] of x0 and [horizon, ...] of x;
     ``()`` where there is none. ``settings``: None inside of a transformation of JAX.
     """

@@ -18,9 +18,10 @@ from jast.outline import outline
 from jast.pytrees import count_numbers
 from jast.results import call_settings
 from jast.rewards import likelihood
-from jast.search import moves as M
 from jast.search.centred import centred
-from jast.search.rounds import begun, residuals, round_of
+from jast.search.moves import SIZE, Point, draw_noise
+from jast.search.paths import distinct_points
+from jast.search.rounds import first_points, residuals, round_of
 from jast.simulator import Simulator
 
 if TYPE_CHECKING:
@@ -28,7 +29,7 @@ if TYPE_CHECKING:
 
     from jast.typing import PathLike
 
-__all__ = ["Refined", "refine"]
+__all__ = ["GRADIENT", "Refined", "first_failing_lift", "lift", "refine"]
 
 POINTS = 16
 """Failures that are pulled side by side."""
@@ -36,14 +37,23 @@ DIFFERENCES = 64
 """Differences of a point in a round."""
 GRADIENT = 4
 """Evaluations that a gradient of distance and log p is counted as."""
-LOOK, LIKE, STILL, STILL_FOR, ENOUGH, FILLING, ALIKE = 5, 0.02, 1e-6, 6, 15, 0.5, 0.7
-"""Rounds between two looks at the points; those nearer to one another than this share of their way
-from the origin go on as one; a point has arrived where so many looks gained less than this share of
-its cost; further failures are started with where there are so many rounds for each, in this share
-of the budget. In the rest, of points with a cosine above the last number only the likeliest goes
-on.
-"""
-LIFTS = 0.0, 1e-6, 1e-5, 1e-4, 1e-3, 1e-2
+LOOK = 5
+"""Rounds between two looks at the points."""
+SAME_PLACE = 0.02
+"""Points nearer to one another than this share of their way from the origin go on as one."""
+SMALL_GAIN = 1e-6
+"""Share of its cost, less than which a point gained in `PATIENCE` looks once it has arrived."""
+PATIENCE = 6
+"""Looks."""
+STARTING = 0.5
+"""Share of the budget in which further failures are started with."""
+MIN_ROUNDS = 15
+"""That are left for each of them; fewer would not bring it near its end."""
+ALIKE = 0.7
+"""In the rest, of points with at least this cosine only the likeliest goes on."""
+LIFTS = np.array([0.0, 1e-6, 1e-5, 1e-4, 1e-3, 1e-2])
+"""How much farther out a point may be taken that is on the knife edge, where one program says that
+it fails and another one that it does not: the least that makes it fail."""
 
 
 @results.result_class("episodes")
@@ -147,49 +157,63 @@ def refine(
     given = jax.device_get(given._replace(states=None))
     about = dict(sim=sim, failures=given, budget=budget, gradients=gradients)
     with open_checkpoint(name, checkpoint, key, **about) as store, keep_answers(store):
-        work = _Work(numpy_generator(key), sim, given, gradients)
+        work = _Refinement(numpy_generator(key), sim, given, gradients)
         work.run(budget)
         return work.result(settings)
+
+
+def lift(points: np.ndarray) -> np.ndarray:
+    """The ``points`` [n, D] by each of `LIFTS` farther from the origin: [L, n, D]."""
+    return points * (1 + LIFTS.astype(points.dtype))[:, None, None]
+
+
+def first_failing_lift(failure: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray]:
+    """Which of ``n`` points fail [m], by the failures of all rows of `lift`, and the row [m] of the
+    least lift of each that does.
+    """
+    failure = failure.reshape(-1, n)
+    points = np.flatnonzero(failure.any(axis=0))
+    return points, np.argmax(failure[:, points], axis=0) * n + points
 
 
 class _Track:
     """One point on its way."""
 
-    def __init__(self, point: M.Point, origin: int, spent: int):
+    def __init__(self, point: Point, origin: int, spent: int):
         self.point, self.origin = point, origin
         self.first = float(point.cost)
         self.log = [(spent, self.first)]
 
-    def still(self) -> bool:
+    def arrived(self) -> bool:
         """Whether the last looks gained nothing to speak of."""
-        if len(self.log) <= STILL_FOR:
+        if len(self.log) <= PATIENCE:
             return False
-        before = self.log[-1 - STILL_FOR][1]
-        return before - self.log[-1][1] <= STILL * abs(before)
+        before = self.log[-1 - PATIENCE][1]
+        return before - self.log[-1][1] <= SMALL_GAIN * abs(before)
 
 
-class _Work:
+class _Refinement:
     """Points on their way, those that have arrived, failures yet to be tried, and the cost."""
 
     def __init__(self, rng, sim, given, gradients):
         self.rng, self.sim, self.given, self.gradients = rng, sim, given, gradients
-        self.centred, self.first = centred(sim), count_numbers(outline(sim).x0)
-        self.v = normal_of(self.centred, given)
+        self.of_modes, self.first = centred(sim), count_numbers(outline(sim).x0)
+        self.v = normal_of(self.of_modes, given)
         self.value = np.asarray(given.reward, np.float64)
         self.left = list(np.argsort(-self.value, kind="stable"))
         self.seen = np.zeros((0, self.v.shape[1]))
         self.live, self.arrived, self.done = [], [], []
-        self.cost = M.SIZE + (GRADIENT if gradients else min(DIFFERENCES, self.v.shape[1]))
+        self.cost = SIZE + (GRADIENT if gradients else min(DIFFERENCES, self.v.shape[1]))
         self.spent = self.invalid = self.turn = 0
 
     def run(self, budget):
-        thinned = False
+        narrowed = False
         while True:
-            if self.spent < FILLING * budget or not self.live + self.arrived:
-                self._fill(budget)
-            elif not thinned:
-                self._thin()
-                thinned = True
+            if self.spent < STARTING * budget or not self.live + self.arrived:
+                self._start_more(budget)
+            elif not narrowed:
+                self._narrow()
+                narrowed = True
             if not self.live:
                 return
             for _ in range(LOOK):
@@ -198,108 +222,78 @@ class _Work:
                 self._round()
             for track in self.live:
                 track.log.append((self.spent, float(track.point.cost)))
-            self._merge()
-            self.arrived += [t for t in self.live if t.still()]
-            self.live = [t for t in self.live if not t.still()]
+            going, _ = self._distinct(distance=SAME_PLACE)
+            self.arrived = [t for t in self.arrived if t in going]
+            self.live = [t for t in self.live if t in going]
+            self.arrived += [t for t in self.live if t.arrived()]
+            self.live = [t for t in self.live if not t.arrived()]
 
-    def _fill(self, budget):
-        """Start with further failures where there is room: as many as get `ENOUGH` rounds."""
-        worth = (budget - self.spent) // (ENOUGH * self.cost)
+    def _distinct(self, **same):
+        """The tracks that are not the same as a likelier one (`distinct_points`), the likeliest
+        first, and the others.
+        """
+        tracks = sorted(self.arrived + self.live, key=lambda t: t.point.cost)
+        rows = distinct_points(np.stack([t.point.v for t in tracks]), **same)
+        chosen = [tracks[i] for i in rows]
+        return chosen, [t for t in self.arrived + self.live if t not in chosen]
+
+    def _start_more(self, budget):
+        """Start with further failures where there is room: as many as get `MIN_ROUNDS`."""
+        worth = (budget - self.spent) // (MIN_ROUNDS * self.cost)
         room = 1 << (max(1, min(POINTS, worth)).bit_length() - 1)
         if 2 * len(self.live) > room or (worth < 1 and self.arrived + self.live):
             return
         rows = self._next(room - len(self.live))
-        if not len(rows):
+        if not rows:
             return
-        lifted = self.v[rows] * (1 + np.array(LIFTS, self.v.dtype))[:, None, None]
-        points, fails = begun(self.centred, lifted.reshape(-1, lifted.shape[-1]))
-        self.spent += len(fails)
-        fails = fails.reshape(len(LIFTS), len(rows))
-        for k, row in enumerate(rows):
-            if fails[:, k].any():
-                first = int(np.argmax(fails[:, k])) * len(rows) + k
-                point = M.Point(*(a[first] for a in points))
-                self.live.append(_Track(point, int(row), self.spent))
+        lifted = lift(self.v[rows]).reshape(-1, self.v.shape[1])
+        points, failure = first_points(self.of_modes, lifted)
+        self.spent += len(failure)
+        for k, row in zip(*first_failing_lift(failure, len(rows)), strict=True):
+            point = Point(*(a[row] for a in points))
+            self.live.append(_Track(point, int(rows[k]), self.spent))
 
     def _next(self, n):
         """At most ``n`` of the failures not yet tried: the likeliest; then by turns the likeliest
         for how far it points away from all that were tried and found, the farthest, and the next.
         """
         found = [t.point.v for t in self.live + self.arrived]
-        known = unit(np.concatenate([self.seen, np.reshape(found, (-1, self.v.shape[1]))]))
+        seen = unit(np.concatenate([self.seen, np.reshape(found, (-1, self.v.shape[1]))]))
         ways, rows = unit(self.v), []
-        worth = np.exp(-2 * (self.value.max(initial=-np.inf) - self.value) / self._scale())
+        best = self.value.max(initial=-np.inf)
+        scale = max(-self.value.max(initial=-1.0), 1.0)
+        worth = np.exp(-2 * (best - self.value) / scale)
         while self.left and len(rows) < n:
             i, turn = 0, len(self.seen) % 4
-            if len(known) and turn != 3:
-                apart = 1 - (ways[self.left] @ known.T).max(axis=1)
+            if len(seen) and turn != 3:
+                apart = 1 - (ways[self.left] @ seen.T).max(axis=1)
                 i = int(np.argmax(apart * worth[self.left] if turn == 1 else apart))
             row = self.left.pop(i)
             rows.append(row)
             self.seen = np.concatenate([self.seen, self.v[row : row + 1]])
-            known = np.concatenate([known, ways[row : row + 1]])
+            seen = np.concatenate([seen, ways[row : row + 1]])
         return rows
-
-    def _scale(self):
-        return max(-self.value.max(initial=-1.0), 1.0)
 
     def _round(self):
         size, points = len(self.live), _stacked(self.live)
-        d, real = points.v.shape[1], points.v.dtype
-        uniform = lambda *shape: self.rng.random((size, *shape)).astype(real)
-        normal = lambda *shape: self.rng.standard_normal((size, *shape)).astype(real)
-        powers = lambda n: (10.0 ** -self.rng.integers(0, 5, (size, n))).astype(real)
-        noise = M.Noise(
-            walks=normal(M.WALKS, d),
-            masks=uniform(M.REMOVALS, d),
-            rates=uniform(M.REMOVALS) ** 2,
-            shrinks=powers(M.REMOVALS),
-            pairs=uniform(M.EXCHANGES, 2, M.ENTRANTS),
-            sizes=powers(M.EXCHANGES),
-            shifts=self._shifts(size).astype(np.int32),
-            fills=normal(M.SHIFTS),
-        )
-        k = min(DIFFERENCES, d)
-        part = None if self.gradients else (k * self.turn + np.arange(k)) % d
-        points, invalid = round_of(self.centred, self.first, points, noise, part)
+        k = min(DIFFERENCES, self.v.shape[1])
+        part = None if self.gradients else (k * self.turn + np.arange(k)) % self.v.shape[1]
+        noise = draw_noise(self.rng, points.v, self.sim.horizon)
+        points, invalid = round_of(self.of_modes, self.first, points, noise, part)
         for i, track in enumerate(self.live):
-            track.point = M.Point(*(a[i] for a in points))
+            track.point = Point(*(a[i] for a in points))
         self.invalid += invalid
         self.turn += 1
         self.spent += size * self.cost
 
-    def _shifts(self, size):
-        """One step later, twice, as more steps are more ways; one sooner; many, either way."""
-        far = self.rng.integers(2, max(3, self.sim.horizon // 3), size)
-        far *= self.rng.choice([-1, 1], size)
-        steps = np.stack([np.ones(size), np.ones(size), -np.ones(size), far], axis=1)
-        most = self.sim.horizon - 1  # one of the steps at least stays
-        return np.clip(steps, -most, most)
-
-    def _merge(self):
-        """Of points of one place the likeliest goes on."""
-        kept = []
-        for t in sorted(self.arrived + self.live, key=lambda t: t.point.cost):
-            size = LIKE * max(float(np.linalg.norm(t.point.v)), 1e-12)
-            if all(np.linalg.norm(t.point.v - other.point.v) > size for other in kept):
-                kept.append(t)
-        self.arrived = [t for t in self.arrived if t in kept]
-        self.live = [t for t in self.live if t in kept]
-
-    def _thin(self):
+    def _narrow(self):
         """Points that are like a likelier one end here: what is left of the budget is for those.
         One that had arrived goes on, as it may have been unlucky.
         """
-        kept, units = [], np.zeros((0, self.v.shape[1]))
-        for t in sorted(self.arrived + self.live, key=lambda t: t.point.cost):
-            way = unit(t.point.v[None])
-            if not len(kept) or (units @ way[0]).max() < ALIKE:
-                kept.append(t)
-                units = np.concatenate([units, way])
-        self.done = [t for t in self.arrived + self.live if t not in kept]
-        for t in kept:
+        going, self.done = self._distinct(cosine=ALIKE)
+        for t in going:
             t.log = t.log[-1:] if t in self.arrived else t.log
-        self.live, self.arrived = kept[:POINTS], kept[POINTS:]
+        self.live, self.arrived = going[:POINTS], going[POINTS:]
 
     def result(self, settings):
         tracks = self.arrived + self.live + self.done
@@ -309,35 +303,40 @@ class _Work:
         before = [[c for at, c in t.log if at <= 0.9 * self.spent] or [t.log[0][1]] for t in tracks]
         late = np.array([c[-1] for c in before]) - costs
         origin, residual = np.array([t.origin for t in tracks], np.int64), np.full(n, np.nan)
+        reward, failing = likelihood(self.sim), {}
         if n:
             points = _stacked(tracks)
             if self.gradients:
                 residual = residuals(points).astype(np.float64)
-        reward, failing = likelihood(self.sim), []
-        if n:
-            lifted = points.v[:, None] * (1 + np.array(LIFTS))[:, None]
-            tries = played(self.centred, lifted.reshape(-1, self.v.shape[1]))
+            lifted = lift(points.v.astype(np.float64)).reshape(-1, self.v.shape[1])
+            tries = played(self.of_modes, lifted)
         for i in range(n):
             own = jax.tree.map(lambda a, i=i: a[origin[i]], self.given)
-            mine = range(len(LIFTS) * i, len(LIFTS) * (i + 1))
-            for e in [*(jax.tree.map(lambda a, k=k: a[k], tries) for k in mine), own]:
+            lifts = (jax.tree.map(lambda a, k=k: a[k], tries) for k in range(i, len(lifted), n))
+            for e in (*lifts, own):
                 # compiled programs may differ on a knife edge: what the replay says counts
                 e = replay(self.sim, e, reward=reward)._replace(states=None)
                 if bool(e.failure):
-                    failing.append((i, jax.device_get(e)))
+                    failing[i] = jax.device_get(e)
                     break
-        if not failing:
-            found, i = empty(self.sim), np.zeros(0, np.int64)
-        else:
-            stacked = jax.tree.map(lambda *a: np.stack(a), *(e for _, e in failing))
-            which = np.array([i for i, _ in failing])
-            found = collect(self.sim, reward, stacked, simulation=which, top=len(which))
+        found, i = empty(self.sim), np.zeros(0, np.int64)
+        if failing:
+            episodes = jax.tree.map(lambda *a: np.stack(a), *failing.values())
+            which = np.array(list(failing))
+            found = collect(self.sim, reward, episodes, simulation=which, top=len(which))
             i = found.simulation
         return Refined(
-            found, origin[i], residual[i], gain[i], late[i], self.spent, self.invalid, settings
+            failures=found,
+            origin=origin[i],
+            residual=residual[i],
+            gain=gain[i],
+            late=late[i],
+            episodes=self.spent,
+            invalid=self.invalid,
+            settings=settings,
         )
 
 
 def _stacked(tracks):
     """The `Point` of all ``tracks``."""
-    return M.Point(*(np.stack(a) for a in zip(*(t.point for t in tracks), strict=True)))
+    return Point(*(np.stack(a) for a in zip(*(t.point for t in tracks), strict=True)))

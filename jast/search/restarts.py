@@ -19,10 +19,20 @@ from jast.distributions.numbers import unflat
 from jast.episode import Episode
 from jast.outline import ask, outline
 from jast.progress import Progress, advance, begin, conclude
-from jast.search import lockstep as E
+from jast.search.lockstep import EMPTY_HASH, Played, fold_hash
 from jast.simulator import Simulator
 
-__all__ = ["Follow", "Noise", "Point", "explore", "follow", "onward", "played", "started"]
+__all__ = [
+    "CHANGES",
+    "Follow",
+    "Noise",
+    "Point",
+    "continue_runs",
+    "exploring_draws",
+    "following_draws",
+    "played_runs",
+    "start_point",
+]
 
 PERSISTING = np.uint32(1 << 31)
 """Address of what persists in the noise of a run, apart from those of its steps."""
@@ -32,18 +42,18 @@ class Point(NamedTuple):
     """An episode on its way."""
 
     progress: Progress
-    t: Any
+    t: jax.Array
     """int32: steps so far."""
-    tag: Any
+    tag: jax.Array
     """uint32: a hash of the disturbances so far."""
 
 
 class Noise(NamedTuple):
     """How a run draws anew, one a lane."""
 
-    width: Any
+    width: jax.Array
     """Of the normal numbers; 1 is the model's."""
-    persisting: Any
+    persisting: jax.Array
     """From 0 to below 1: the share of the normal numbers that is the same at every step."""
 
 
@@ -54,20 +64,20 @@ class Follow(NamedTuple):
     rows: Any
     """[horizon, ...]: the disturbances of that episode, and"""
     x0: Any
-    length: Any
+    length: jax.Array
     """int32: how many they are; beyond them it draws anew."""
-    rate: Any
+    rate: jax.Array
     """Share of the steps that it changes, by"""
-    change: Any
+    change: jax.Array
     """int32, one of `CHANGES`."""
-    size: Any
+    size: jax.Array
     """Of the changes, from 0 to 1."""
 
 
 CHANGES = "anew", "to the mode", "towards the mode", "a step aside"
 
 
-def onward(
+def continue_runs(
     sim: Simulator,
     reward: Any,
     keys: jax.Array,
@@ -95,18 +105,20 @@ def onward(
         The `Point` [N] of each end, how many steps are new [N], the new disturbances [most, N, ...]
         and the points after each of them [most, N], or ``()``.
     """
-    like = outline(sim)
     (n,) = until.shape
-    space = lambda s: jnp.zeros((most, n, *s.shape), s.dtype)
-    xs = jax.tree.map(space, like.x)
+    xs = jax.tree.map(lambda s: jnp.zeros((most, n, *s.shape), s.dtype), outline(sim).x)
     way = jax.tree.map(lambda a: jnp.zeros((most, *a.shape), a.dtype), points) if keep else ()
     until = jnp.minimum(until, sim.horizon)
-    on = lambda p: ~p.progress.done & (p.t < until)
+
+    def on(p):
+        return ~p.progress.done & (p.t < until)
 
     def move(key, p, own, on):
         x = draw(key, p.t, own, sim.disturbance(p.progress.state))
         new = Point(
-            advance(sim, reward, p.progress, x, p.t + 1 >= sim.horizon), p.t + 1, E.fold(p.tag, x)
+            advance(sim, reward, p.progress, x, p.t + 1 >= sim.horizon),
+            p.t + 1,
+            fold_hash(p.tag, x),
         )
         return x, jax.tree.map(lambda a, b: jnp.where(on, a, b), new, p)
 
@@ -114,22 +126,24 @@ def onward(
         i, p, new, xs, way = carry
         live = on(p)
         x, p = jax.vmap(move)(keys, p, own, live)
-        put = lambda to, a: jax.tree.map(lambda s, v: s.at[i].set(v), to, a)
-        return i + 1, p, new + live.astype(jnp.int32), put(xs, x), put(way, p) if keep else ()
+        xs, way = jax.tree.map(lambda s, v: s.at[i].set(v), (xs, way), (x, p if keep else ()))
+        return i + 1, p, new + live.astype(jnp.int32), xs, way
 
     first = jnp.zeros((), jnp.int32), points, jnp.zeros(n, jnp.int32), xs, way
     _, end, new, xs, way = lax.while_loop(lambda c: jnp.any(on(c[1])) & (c[0] < most), step, first)
     return end, new, xs, way
 
 
-def started(sim: Simulator, reward: Any, x0: Any) -> Point:
+def start_point(sim: Simulator, reward: Any, x0: Any) -> Point:
     """The `Point` that x0 leads to, before any step."""
-    return Point(begin(sim, reward, x0), jnp.zeros((), jnp.int32), E.fold(jnp.uint32(E.FIRST), x0))
+    return Point(
+        begin(sim, reward, x0), jnp.zeros((), jnp.int32), fold_hash(jnp.uint32(EMPTY_HASH), x0)
+    )
 
 
-def played(
+def played_runs(
     sim: Simulator, reward: Any, x0: Any, rows: Any, points: Point, end: Point, new: Any, xs: Any
-) -> E.Played:
+) -> Played:
     """What runs [N] came to: whole episodes, of x0 and the disturbances ``rows`` [N, horizon, ...]
     up to ``points`` and the new ones after them.
     """
@@ -145,27 +159,27 @@ def played(
     value = jnp.where(finite, ended.reward, -jnp.inf)
     distance = jnp.where(known, ended.distance, jnp.inf)
     episode = Episode(x0, rows, ended.log_prob, distance, ended.failure & finite, end.t, value)
-    return E.Played(episode, ~finite, end.tag)
+    return Played(episode, ~finite, end.tag)
 
 
-def explore(sim: Simulator) -> tuple[Callable, Callable]:
-    """``draw`` of `onward` with a `Noise`, and likewise ``draw_start(key, noise, p(x0))``: draws of
-    the model, of wider noise where it has quantile functions.
+def exploring_draws(sim: Simulator) -> tuple[Callable, Callable]:
+    """``draw`` of `continue_runs` with a `Noise`, and likewise ``draw_start(key, noise, p(x0))``:
+    draws of the model, of wider noise where it has quantile functions.
     """
     about = outline(sim)
-    return (
-        _fresh if about.disturbance.quantile else lambda key, t, own, dist: _sampled(key, t, dist),
-        (lambda key, own, dist: _start(key, own, dist))
-        if about.start.quantile
-        else (lambda key, own, dist: D.sample(dist, jax.random.fold_in(key, 0))),
-    )
+    step = _fresh if about.disturbance.quantile else _sampled
+    return step, _fresh_start if about.start.quantile else _sampled_start
 
 
-def _sampled(key, t, dist):
+def _sampled(key, t, own, dist):
     return D.sample(dist, jax.random.fold_in(key, t + 1))
 
 
-def _start(key, own, dist):
+def _sampled_start(key, own, dist):
+    return D.sample(dist, jax.random.fold_in(key, 0))
+
+
+def _fresh_start(key, own, dist):
     z = own.width * _normal(jax.random.fold_in(key, 0), dist, own.width.dtype)
     return D.from_normal(dist, unflat(z, D.event_like(dist)))
 
@@ -183,10 +197,10 @@ def _normal(key, dist, dtype):
     return jax.random.normal(key, (numbers,), dtype)
 
 
-def follow(sim: Simulator) -> tuple[Callable, Callable]:
+def following_draws(sim: Simulator) -> tuple[Callable, Callable]:
     """The same two with a `Follow`."""
     about = outline(sim)
-    fresh, fresh_start = explore(sim)
+    fresh, fresh_start = exploring_draws(sim)
     of_step, of_start = ask(sim, lambda start, state, dist: (_aside(dist), _aside(start)))
     step = _changer(about.disturbance.mode, of_step)
     start = _changer(about.start.mode, of_start)
@@ -221,10 +235,11 @@ def _changer(has_mode: bool, aside: bool) -> Callable:
         if aside:
             z = D.to_normal(dist, x)
             e = unflat(_normal(noise, dist, dtype), D.event_like(dist))
-            mix = lambda z, e: (
-                jnp.sqrt(1 - own.size**2).astype(z.dtype) * z + own.size.astype(z.dtype) * e
+            keep = jnp.sqrt(1 - own.size**2)
+            mixed = jax.tree.map(
+                lambda z, e: keep.astype(z.dtype) * z + own.size.astype(z.dtype) * e, z, e
             )
-            ways[3] = D.from_normal(dist, jax.tree.map(mix, z, e))
+            ways[3] = D.from_normal(dist, mixed)
         changed = jax.tree.map(
             lambda *each: jnp.stack([a.astype(each[0].dtype) for a in each])[own.change], *ways
         )

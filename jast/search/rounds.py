@@ -3,6 +3,8 @@ the slopes that the next candidates follow. The system's steps are in two progra
 `jast.judge` and that of the gradients.
 """
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -15,11 +17,23 @@ from jast.judge import judged
 from jast.limit_state import Outcomes, policy_of
 from jast.pytrees import map_in_lanes
 from jast.rewards import likelihood
-from jast.search import moves as M
+from jast.search.moves import (
+    NEAREST,
+    RAYS,
+    Noise,
+    Point,
+    boundary_direction,
+    candidates,
+    resize_steps,
+)
 from jast.simulator import Simulator
 
-__all__ = ["begun", "residuals", "round_of"]
+__all__ = ["first_points", "residuals", "round_of"]
 
+FIRST_GAP = 0.3
+"""How far inside the failures a point may be at first, as a share of its way from the origin."""
+FIRST_WIDTH = 0.5
+"""Of the first random steps, likewise."""
 ASIDE = 1e-4
 """How far aside numbers at 0 are moved for gradients: there may be a kink."""
 OUTSIDE = 0.01
@@ -30,18 +44,27 @@ GROUP = 4
 """Points whose gradients are one call of the program."""
 
 
-def begun(sim: Simulator, v: np.ndarray) -> tuple[M.Point, np.ndarray]:
+def first_points(sim: Simulator, v: np.ndarray) -> tuple[Point, np.ndarray]:
     """The `Point` of each of ``v`` [n, D], and which of them fail."""
     o = _judged(sim, v[:, None])
-    full = lambda value: np.full(len(v), value, v.dtype)
-    zero = np.zeros_like(v)
-    cost, used = -o.log_p[:, 0].astype(v.dtype), o.used[:, 0]
-    return M.Point(v, cost, used, full(0.3), full(1), full(0.5), zero, zero, zero), o.failure[:, 0]
+    one, zero = np.ones(len(v), v.dtype), np.zeros_like(v)
+    point = Point(
+        v=v,
+        cost=-o.log_p[:, 0].astype(v.dtype),
+        used=o.used[:, 0],
+        gap=FIRST_GAP * one,
+        length=one,
+        width=FIRST_WIDTH * one,
+        last=zero,
+        slope=zero,
+        rise=zero,
+    )
+    return point, o.failure[:, 0]
 
 
 def round_of(
-    sim: Simulator, first: int, points: M.Point, noise: M.Noise, part: np.ndarray | None
-) -> tuple[M.Point, int]:
+    sim: Simulator, first: int, points: Point, noise: Noise, part: np.ndarray | None
+) -> tuple[Point, int]:
     """One round of all ``points`` [n] with their ``noise``, and how many of the candidates were
     invalid. ``part`` [k]: the numbers whose slopes are told anew, by differences; None: those of
     all, by gradients. ``first``: how many numbers are of the start.
@@ -50,31 +73,30 @@ def round_of(
     usable = _usable(*told)
     slope, rise = (np.where(usable, a, 0) for a in told)
     points = points._replace(slope=slope, rise=rise)
-    moves = M.around(points, noise, first, sim.horizon)
-    o = _judged(sim, moves)
-    cost = np.where(o.failure, -o.log_p, np.inf).astype(moves.dtype)
+    tried = candidates(points, noise, first, sim.horizon)
+    o = _judged(sim, tried)
+    cost = np.where(o.failure, -o.log_p, np.inf).astype(tried.dtype)
     i, rows = np.argmin(cost, axis=1), np.arange(len(cost))
     better = cost[rows, i] < points.cost
-    new = M.resized(points, i, better, o.failure[:, : M.RAYS])
-    decides = np.arange(moves.shape[2]) < o.used[rows, i][:, None]
-    best = np.where(decides, moves[rows, i], 0)  # the others stay at the mode
-    took = lambda a, b: np.where(better.reshape(-1, *(1,) * (a.ndim - 1)), a, b)
+    new = resize_steps(points, i, better, o.failure[:, :RAYS])
+    decides = np.arange(tried.shape[2]) < o.used[rows, i][:, None]
+    best = np.where(decides, tried[rows, i], 0)  # the others stay at the mode
     new = new._replace(
-        v=took(best, points.v),
-        cost=took(cost[rows, i], points.cost),
-        used=took(o.used[rows, i], points.used),
-        last=took(best - points.v, points.last),
+        v=np.where(better[:, None], best, points.v),
+        cost=np.where(better, cost[rows, i], points.cost),
+        used=np.where(better, o.used[rows, i], points.used),
+        last=np.where(better[:, None], best - points.v, points.last),
     )
     return new, int(o.invalid.sum())
 
 
-def residuals(points: M.Point) -> np.ndarray:
+def residuals(points: Point) -> np.ndarray:
     """How far each of ``points`` [n] was, at its last round, from the conditions of Karush, Kuhn
     and Tucker: the slope of its cost along the boundary, as a share of the whole slope; NaN where
     the distance has none.
     """
-    whole = np.maximum(np.linalg.norm(points.rise, axis=1), M.NEAREST)
-    share = np.linalg.norm(M.along(points), axis=1) / whole
+    whole = np.maximum(np.linalg.norm(points.rise, axis=1), NEAREST)
+    share = np.linalg.norm(boundary_direction(points), axis=1) / whole
     return np.where(_usable(points.slope, points.rise)[:, 0], share, np.nan)
 
 
@@ -100,8 +122,11 @@ def _gradients(sim, points):
     """
     v = (1 - np.minimum(points.gap, OUTSIDE))[:, None] * points.v
     v = np.where(v == 0, -ASIDE * np.sign(points.slope), v).astype(points.v.dtype)
-    run = lambda v: map_in_lanes(GROUP, lambda v: _slopes(sim, v), v)
-    found = step_once(lambda: run(v), v, like=lambda: jnp.zeros((len(v), 2, v.shape[1]), v.dtype))
+    found = step_once(
+        lambda: map_in_lanes(GROUP, partial(_slopes, sim), v),
+        v,
+        like=lambda: jnp.zeros((len(v), 2, v.shape[1]), v.dtype),
+    )
     return found[:, 0], found[:, 1]
 
 

@@ -17,94 +17,116 @@ from jast.limit_state import dimension, normal_numbers
 from jast.markov import proposed
 from jast.outline import outline
 from jast.pytrees import count_numbers
-from jast.search import kept as K
-from jast.search import lockstep as E
+from jast.search.lockstep import Played, Tally, play_lanes
 from jast.simulator import Simulator
 
-__all__ = ["Chains", "look", "walk"]
+__all__ = ["Chains", "Points", "draw_wider", "move_chains", "no_points"]
 
 ACCEPTANCE = 0.3
-MOVES, SWAPS = np.uint32(1), np.uint32(2)
-"""Addresses of random numbers."""
+"""Share of the moves taken that the scale of the moves is adapted to: near what is optimal for
+random walks (Roberts, Gelman and Gilks 1997)."""
+ADAPTATION = 0.3
+"""How fast: change of the logarithm of the scale per share too much."""
+MIN_SCALE = 0.005
+"""Of the moves."""
+MEMORY = 0.95
+"""Of the share of the moves taken, kept from one move to the next."""
+SWAP_MEMORY = 0.9
+"""Of the share of the exchanges, kept from one to the next."""
+MOVES = np.uint32(1)
+"""Address of the random numbers of moves."""
+SWAPS = np.uint32(2)
+"""Address of those of exchanges."""
+
+
+class Points(NamedTuple):
+    """Points [...] of normal numbers, and what their episodes came to."""
+
+    z: jax.Array
+    """[..., D]"""
+    used: jax.Array
+    """int32: how many of the numbers decide the episode."""
+    failing: jax.Array
+    """bool; one that does not fail yet goes to lesser distances."""
+    distance: jax.Array
 
 
 class Chains(NamedTuple):
     """L widths, of C chains each."""
 
-    z: Any
-    """[L, C, D]"""
-    used: Any
-    """[L, C] int32: how many of the numbers decide the episode."""
-    failing: Any
-    """[L, C] bool; one that does not fail yet goes to lesser distances."""
-    distance: Any
+    points: Points
     """[L, C]"""
-    scale: Any
+    scale: jax.Array
     """[L] of the moves."""
-    accepted: Any
+    accepted: jax.Array
     """[L] share of the moves so far, of late."""
-    swapped: Any
+    swapped: jax.Array
     """[L - 1] share of the exchanges with the next width, of late."""
 
 
+def no_points(n: int, d: int, dtype: Any) -> Points:
+    """Points [n] that mean nothing."""
+    zero = np.zeros(n, np.int32)
+    return Points(np.zeros((n, d), dtype), zero, zero > 0, zero.astype(dtype))
+
+
 @partial(jit, static_argnames="lanes")
-def look(key, sim, reward, lanes, kept, begin, end, width):
-    """Draws of noise of this width: ((`Kept`, (z, used, failing, distance) of the lanes),
-    `E.Tally`).
-    """
+def draw_wider(key, sim, reward, lanes, best, begin, end, width):
+    """Draws of noise of this width: ((`BestEpisodes`, `Points` of the lanes), `Tally`)."""
     number = begin + jnp.arange(lanes, dtype=jnp.int32)
     live = number < end
     z = width * _noise(key, sim, number)
     played = play(sim, reward, z, live)
-    kept = K.merged(kept, played, live, number)
-    return (kept, (z, *_state(sim, played, live))), E.tally(played, live, number)
+    best = best.merge(played, live, number)
+    return (best, _points(sim, z, played, live)), Tally.of(played, live, number)
 
 
 @jit
-def walk(key, sim, reward, kept, chains, widths, begin, end):
-    """Moves of all chains, and after each round exchanges, until ``end``: ((`Kept`, `Chains`),
-    `E.Tally`).
+def move_chains(key, sim, reward, best, chains, widths, begin, end):
+    """Moves of all chains, and after each round exchanges, until ``end``: ((`BestEpisodes`,
+    `Chains`), `Tally`).
     """
-    levels, each, d = chains.z.shape
-    lanes, real = levels * each, chains.z.dtype
-    flat, apart = (lambda a: a.reshape(lanes, *a.shape[2:])), (lambda a: a.reshape(levels, each))
+    levels, each, d = chains.points.z.shape
+    lanes, real = levels * each, chains.points.z.dtype
+
+    def flat(tree):
+        return jax.tree.map(lambda a: a.reshape(lanes, *a.shape[2:]), tree)
+
+    def by_level(tree):
+        return jax.tree.map(lambda a: a.reshape(levels, each, *a.shape[1:]), tree)
 
     def block(carry):
-        at, (kept, chains), counted = carry
+        at, (best, chains), tally = carry
+        old = chains.points
         number = at + jnp.arange(lanes, dtype=jnp.int32)
         live = (number < end) & (number >= begin)
         noise = _noise(key, sim, number).reshape(levels, each, d)
         scale, width = chains.scale[:, None, None], widths[:, None, None]
         z = jnp.where(
-            chains.failing[:, :, None],
-            proposed(chains.z, noise, scale, width),
-            chains.z + scale * width * noise,
+            old.failing[:, :, None],
+            proposed(old.z, noise, scale, width),
+            old.z + scale * width * noise,
         )
         played = play(sim, reward, flat(z), live)
-        kept = K.merged(kept, played, live, number)
-        counted = E.add(counted, E.tally(played, live, number))
-        used, failing, distance = map(apart, _state(sim, played, live))
-        take = apart(live & ~played.invalid) & (
-            failing | (~chains.failing & (distance <= chains.distance))
-        )
-        pick = lambda a, b: jax.vmap(jax.vmap(jnp.where))(take, a, b)
+        best = best.merge(played, live, number)
+        tally = tally.add(Tally.of(played, live, number))
+        new = by_level(_points(sim, flat(z), played, live))
+        nearer = ~old.failing & (new.distance <= old.distance)
+        take = by_level(live & ~played.invalid) & (new.failing | nearer)
         share = jnp.mean(take, axis=1, dtype=real)
-        scale = jnp.clip(chains.scale * jnp.exp(0.3 * (share - ACCEPTANCE)), 0.005, 1)
+        scale = chains.scale * jnp.exp(ADAPTATION * (share - ACCEPTANCE))
         chains = chains._replace(
-            z=pick(z, chains.z),
-            used=pick(used, chains.used),
-            failing=pick(failing, chains.failing),
-            distance=pick(distance, chains.distance),
-            scale=scale,
-            accepted=0.95 * chains.accepted + 0.05 * share,
+            points=jax.tree.map(partial(jax.vmap(jax.vmap(jnp.where)), take), new, old),
+            scale=jnp.clip(scale, MIN_SCALE, 1),
+            accepted=MEMORY * chains.accepted + (1 - MEMORY) * share,
         )
         coin = jax.random.fold_in(jax.random.fold_in(key, SWAPS), at)
-        return at + lanes, (kept, _exchanged(chains, widths, coin, at // lanes)), counted
+        return at + lanes, (best, _exchanged(chains, widths, coin, at // lanes)), tally
 
-    _, carry, counted = lax.while_loop(
-        lambda c: (c[0] < end) & (c[0] >= begin), block, (begin, (kept, chains), E.nothing())
+    _, carry, tally = lax.while_loop(
+        lambda c: (c[0] < end) & (c[0] >= begin), block, (begin, (best, chains), Tally.none())
     )
-    return carry, counted
+    return carry, tally
 
 
 def _exchanged(chains, widths, key, turn):
@@ -113,35 +135,34 @@ def _exchanged(chains, widths, key, turn):
     Numbers that decide nothing are independent of the others: they are left out of the odds, and
     scaled to their new width.
     """
-    levels, each, d = chains.z.shape
-    real = chains.z.dtype
-    live = jnp.arange(d, dtype=jnp.int32)[None, None] < chains.used[:, :, None]
-    square = jnp.sum(jnp.where(live, chains.z, 0) ** 2, axis=2)
-    used = chains.used.astype(real)
+    points = chains.points
+    levels, each, d = points.z.shape
+    real = points.z.dtype
+    number = jnp.arange(d, dtype=jnp.int32)[None, None]
+    decides = number < points.used[:, :, None]
+    square = jnp.sum(jnp.where(decides, points.z, 0) ** 2, axis=2)
+    used = points.used.astype(real)
     upper, lower = widths[:-1, None], widths[1:, None]
     odds = 0.5 * (upper**-2 - lower**-2) * (square[:-1] - square[1:]) + (
         used[:-1] - used[1:]
     ) * jnp.log(upper / lower)
     coin = jnp.log(jax.random.uniform(key, odds.shape, real, minval=1e-30))
     ours = (jnp.arange(levels - 1, dtype=jnp.int32) % 2 == turn % 2)[:, None]
-    swap = ours & (coin < odds) & chains.failing[:-1] & chains.failing[1:]
-    no = jnp.zeros((1, each), jnp.int32)
+    swap = ours & (coin < odds) & points.failing[:-1] & points.failing[1:]
+    none = jnp.zeros((1, each), jnp.int32)
     down, up = swap.astype(jnp.int32), -swap.astype(jnp.int32)
-    place = jnp.arange(levels, dtype=jnp.int32)[:, None]
-    source = place + jnp.concatenate([down, no]) + jnp.concatenate([no, up])
+    level = jnp.arange(levels, dtype=jnp.int32)[:, None]
+    source = level + jnp.concatenate([down, none]) + jnp.concatenate([none, up])
     column = jnp.broadcast_to(jnp.arange(each, dtype=jnp.int32)[None], source.shape)
-    z, used, failing, distance = jax.tree.map(
-        lambda a: a[source, column], (chains.z, chains.used, chains.failing, chains.distance)
-    )
+    points = jax.tree.map(lambda a: a[source, column], points)
     ratio = (widths[:, None] / widths[source])[:, :, None]
-    live = jnp.arange(d, dtype=jnp.int32)[None, None] < used[:, :, None]
-    z = jnp.where(live, z, ratio * z)
-    share = jnp.mean(swap, axis=1, dtype=real)
-    swapped = jnp.where(ours[:, 0], 0.9 * chains.swapped + 0.1 * share, chains.swapped)
-    return chains._replace(z=z, used=used, failing=failing, distance=distance, swapped=swapped)
+    decides = number < points.used[:, :, None]
+    points = points._replace(z=jnp.where(decides, points.z, ratio * points.z))
+    share = SWAP_MEMORY * chains.swapped + (1 - SWAP_MEMORY) * jnp.mean(swap, axis=1, dtype=real)
+    return chains._replace(points=points, swapped=jnp.where(ours[:, 0], share, chains.swapped))
 
 
-def play(sim: Simulator, reward: Any, z: jax.Array, live: jax.Array) -> E.Played:
+def play(sim: Simulator, reward: Any, z: jax.Array, live: jax.Array) -> Played:
     """The episodes of the points ``z`` [n, D], with their disturbances."""
     like = outline(sim)
     size = count_numbers(like.x0)
@@ -150,23 +171,24 @@ def play(sim: Simulator, reward: Any, z: jax.Array, live: jax.Array) -> E.Played
         z[:, size:].reshape(len(z), sim.horizon, -1)
     )
     rows = jax.tree.map(lambda a: a[None], z0), jax.tree.map(lambda a: jnp.moveaxis(a, 1, 0), steps)
-    draw = lambda key, row, dist: D.from_normal(dist, row)
     keys = jax.vmap(jax.random.key)(jnp.zeros(len(z), jnp.uint32))
-    return E.play(sim, reward, keys, draw, draw, live, rows, record=True)
+
+    def draw(key, row, dist):
+        return D.from_normal(dist, row)
+
+    return play_lanes(sim, reward, keys, draw, draw, live, rows, record=True)
 
 
-def _state(sim, played, live):
-    """Of played episodes: how many of the numbers decided them, whether they failed, distances."""
+def _points(sim, z, played, live):
+    """The `Points` of ``z`` [n, D], as they were played."""
     like, e = outline(sim), played.episode
-    used = count_numbers(like.x0) + e.length * count_numbers(like.x)
+    used = (count_numbers(like.x0) + e.length * count_numbers(like.x)).astype(jnp.int32)
     distance = jnp.where(live & ~played.invalid, e.distance, jnp.inf)
-    return used.astype(jnp.int32), e.failure & live, distance
+    return Points(z, used, e.failure & live, distance)
 
 
 def _noise(key, sim, number):
     """Standard normal numbers [n, D] of the episodes of these numbers [n]."""
     key = jax.random.fold_in(key, MOVES)
-    draw = lambda i: jax.random.normal(
-        jax.random.fold_in(key, i), (dimension(sim),), normal_numbers(sim)
-    )
-    return jax.vmap(draw)(number)
+    shape, dtype = (dimension(sim),), normal_numbers(sim)
+    return jax.vmap(lambda i: jax.random.normal(jax.random.fold_in(key, i), shape, dtype))(number)

@@ -52,7 +52,7 @@ class Edges(NamedTuple):
     """[S, B] bool: there is such an edge."""
 
 
-def edges_of(problem, axes, tree, children):
+def edges_of(problem, tree, children, axes=None):
     """The `Edges` of trees that keep states at every node; ``children``: the greatest number of a
     node.
     """
@@ -107,7 +107,7 @@ class Branches(NamedTuple):
     """[S, B] bool: that episode failed."""
 
 
-def branches_of(problem, axes, tree, children):
+def branches_of(problem, tree, children, axes=None):
     """The `Branches` of trees that keep states at every node; ``children`` as for `edges_of`."""
     node, child, visits, q, valid = _numbers(problem, tree, children)
     parent, slot = node.parent[1:], node.slot[1:]
@@ -166,5 +166,5 @@ def _numbers(problem, tree, children):
     visits, total = tree.edges[at + VISITS], tree.edges[at + RETURNS]
     own = jnp.take_along_axis(node.reward, parent, axis=0)  # up to s
     valid = ((tree.outcome & FRESH) > 0) & ~tree.ended[None] & (visits > 0)
-    q = jnp.where(valid, problem.onward(total, visits, own), 0)
+    q = jnp.where(valid, problem.q_value(total, visits, own), 0)
     return node, tree.edges[at + CHILD], visits, q, valid

@@ -1,11 +1,11 @@
 """A forest by its settings: what `jast.search.forest` and `jast.search.mcts` have in common, from
 their arguments to their result.
 
-`plan` says what is to be grown, `enlist` adds the heads that guide it, `grow_rounds` grows it, and
-`grow_trees` is all of them in a row.
+`plan` says what is to be grown, `with_heads` adds the heads that guide it, `grow_rounds` grows it,
+and `grow_trees` is all of them in a row.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import jax
@@ -19,19 +19,20 @@ from jast.counter import tree_keys
 from jast.heads.rounds import HeadTraining, init_heads, train_heads
 from jast.heads.settings import MODES as HEAD_MODES
 from jast.heads.settings import HeadSettings, check_settings
-from jast.incidents import incidents, merge_incidents, new_incidents, runs_on_host
+from jast.incidents import incidents, runs_on_host
 from jast.rewards import STANDARD, Lexicographic, lexicographic
-from jast.search.ending import ended, planned, usual
-from jast.search.lockstep import whole
-from jast.search.pilot import Pilot, joined
+from jast.search.driver import complete, require_counts
+from jast.search.ending import default_share, with_refine_share
+from jast.search.pilot import Calibration, with_calibration
 from jast.search.prepare import default_actions, prepare
 from jast.search.result import SearchResult
 from jast.search.tree.guide import guide
 from jast.search.tree.harvest import result, traced_result
 from jast.search.tree.layout import Problem, levels, pages_of
-from jast.search.tree.memory import LANES, fit, keep
+from jast.search.tree.memory import LANES, fit, require_rewards
 from jast.search.tree.run import Plan, Round, grow_all, grow_traced
-from jast.search.tree.settings import problem_of
+from jast.search.tree.settings import mode_settings, problem_of
+from jast.simulator import Simulator
 from jast.watch import Watch
 
 __all__ = ["grow_trees"]
@@ -39,11 +40,16 @@ __all__ = ["grow_trees"]
 MEMOIZE = ("auto", "node", "root", "none")
 PUBLISHED = ("code", "text", "paper", "thesis")
 """Modes that maximise the reward of before by default, over draws of the model."""
-LEAST = 64
-"""Trees of a group with an executor, at least: fewer in lockstep cost more each."""
-BOUNDED = 1.0
-"""``exploration`` for `jast.rewards.lexicographic`, whose range is (-1, 1]."""
-CHUNK, HOST_CHUNK = 500, 10  # simulations of a tree between two looks at the keyboard
+EXECUTOR_LANES = 64
+"""Trees of a group with an executor, at least: fewer side by side cost more each."""
+EXPLORATION = 10.0
+"""The published one."""
+BOUNDED_EXPLORATION = 1.0
+"""For `jast.rewards.lexicographic`, whose range is (-1, 1]."""
+CHUNK = 500
+"""Simulations of a tree between two looks at the keyboard."""
+HOSTED_CHUNK = 10
+"""Those of a system on the host."""
 
 
 class Job(NamedTuple):
@@ -55,27 +61,37 @@ class Job(NamedTuple):
     trees: int
     at_once: int
     """Trees of a round: all of them where no heads learn."""
+    top: int
     settings: dict | None
     """What was asked for, for the result; None in a traced search."""
-    pilot: Pilot | None = None
+    calibration: Calibration | None = None
     """The episodes that gave the scales."""
     school: HeadTraining | None = None
     """The heads, where there are any."""
     head_settings: HeadSettings | None = None
 
+    @property
+    def sim(self) -> Simulator:
+        return self.problem.sim
+
+    @property
+    def reward(self) -> Any:
+        return self.problem.reward
+
 
 def grow_trees(
     method: str,
+    modes: Mapping[str, dict],
     key: jax.Array,
-    sim: Any,
-    chosen: dict[str, Any],
+    sim: Simulator,
     *,
     trees: int,
     prunes: int,
     simulations: int,
+    mode: str,
     reward: Any,
     actions: Any,
-    exploration: Any,
+    exploration: float | None,
     memoize: str,
     refine: float | None,
     top: int,
@@ -91,41 +107,29 @@ def grow_trees(
     devices: Any,
     heads: Any = None,
     head_settings: HeadSettings | None = None,
+    **choices: Any,
 ) -> SearchResult:
-    """A forest by its settings, all given: what `forest` and `mcts` call. ``chosen``: of
-    `jast.search.tree.settings.settled`.
+    """A forest by the arguments of `jast.search.forest`, which ``method`` was called with;
+    ``modes`` and ``choices`` as for `jast.search.tree.settings.mode_settings`.
     """
+    chosen = mode_settings(method, modes, mode, actions, **choices)
     counts = dict(trees=trees, prunes=prunes, simulations=simulations, top=top)
     given = {k: n for k, n in dict(threads=threads, lanes=lanes).items() if n is not None}
-    trees, prunes, simulations, top, *_ = whole(method, **counts, **given)
+    trees, prunes, simulations, top, *_ = require_counts(method, **counts, **given)
     before, ways = incidents(sim), units.placement(method, executor, devices)
-    asked = (
-        counts
-        | given
-        | dict(
-            sim=sim,
-            chosen=chosen,
-            reward=reward,
-            actions=actions,
-            exploration=exploration,
-            memoize=memoize,
-            record=bool(record),
-            keep_trees=bool(keep_trees),
-            heads=heads,
-            head_settings=head_settings,
-        )
-    )
-    job = plan(
-        method, key, sim, chosen, trees, prunes, simulations, reward, actions, exploration, memoize
-    )
-    share = 0.0 if chosen["mode"] in PUBLISHED else usual(sim, job.problem.reward)
-    job = job._replace(settings=planned(method, refine, sim, job.settings, share))
+    about = dict(sim=sim, chosen=chosen, reward=reward, actions=actions, exploration=exploration)
+    about |= dict(memoize=memoize, record=bool(record), keep_trees=bool(keep_trees))
+    about |= dict(heads=heads, head_settings=head_settings)
+    job = plan(method, key, sim, chosen, counts, reward, actions, exploration, memoize)
+    share = 0.0 if mode in PUBLISHED else default_share(sim, job.reward)
+    job = job._replace(settings=with_refine_share(method, refine, sim, job.settings, share))
     if heads is not None:
-        job = enlist(job, key, heads, head_settings, chosen, memoize)
+        job = with_heads(job, key, heads, head_settings, mode, memoize)
     if job.settings is None:
         units.require_untraced(method, checkpoint=checkpoint, executor=executor, devices=devices)
-        found = traced_result(grow_traced(job.problem, tree_keys(key, trees), job.plan))
-        return joined(sim, job.problem.reward, job.pilot, found, top)
+        grown = grow_traced(job.problem, tree_keys(key, trees), job.plan)
+        found = traced_result(sim, job.reward, grown)
+        return with_calibration(sim, job.reward, job.calibration, found, top)
     if keep_trees and memoize in ("root", "none"):
         raise ValueError(
             f'{method}: memoize must be "node" or "auto" with keep_trees=True, which needs states'
@@ -133,50 +137,45 @@ def grow_trees(
         )
     wanted = job.plan._replace(record=bool(record), branches=bool(keep_trees))
     if lanes is None and executor is not None:
-        lanes = min(LANES, -(-job.at_once // max(job.at_once // LEAST, 1)))
+        lanes = min(LANES, -(-job.at_once // max(job.at_once // EXECUTOR_LANES, 1)))
     if devices is not None:
         threads = len(ways.devices)
     fitted, threads, lanes = fit(
         method, job.problem, wanted, job.at_once, threads, lanes, available, memoize == "auto"
     )
     total = trees * fitted.prunes * simulations
-    keep(method, sim, total, bool(record))
+    require_rewards(method, sim, total, bool(record))
     with (
-        open_checkpoint(method, checkpoint, key, **asked) as store,
+        open_checkpoint(method, checkpoint, key, **counts, **given, **about) as store,
         Watch(method, total, "sim", progress, callback) as watch,
     ):
         if store is not None:  # what was free when it began may not be now
             first = store.choose_once(lambda: dict(memoize=fitted.memoize, lanes=lanes))
             fitted, lanes = fitted._replace(memoize=first["memoize"]), first["lanes"]
         job = job._replace(plan=fitted)
-        ran, school = grow_rounds(job, key, threads, lanes, top, watch, ways._replace(store=store))
+        ran, school = grow_rounds(job, key, threads, lanes, watch, ways._replace(store=store))
     settings = job.settings | dict(prunes=job.plan.prunes, memoize=job.plan.memoize)
     if job.school is not None:
-        settings |= _of_heads(heads, job)
+        settings |= _settings_of_heads(heads, job)
     if short := units.describe_missing("simulations", ran, watch.done, watch.total):
-        settings = settings | dict(interrupted=short)
-    found = result(sim, job.problem.reward, ran.state, settings, top, school)
-    found = joined(sim, job.problem.reward, job.pilot, found, top)
-    found = ended(key, sim, job.problem.reward, found, top)
-    return found._replace(
-        incidents=merge_incidents(new_incidents(before, incidents(sim)), ran.incidents)
-    )
+        settings |= dict(interrupted=short)
+    found = result(job, ran.state, settings, school)
+    return complete(key, job, found, before, job.calibration, ran.incidents)
 
 
 def plan(
     method: str,
     key: jax.Array,
-    sim: Any,
+    sim: Simulator,
     chosen: dict[str, Any],
-    trees: int,
-    prunes: int,
-    simulations: int,
+    counts: dict[str, int],
     reward: Any,
     actions: Any,
-    exploration: Any,
+    exploration: float | None,
     memoize: str,
 ) -> Job:
     """The `Job` without heads; ValueError for settings that do not fit one another or ``sim``."""
+    trees, simulations = counts["trees"], counts["simulations"]
     if memoize not in MEMOIZE:
         raise ValueError(
             f'{method}: memoize must be "auto", "node", "root" or "none", received {memoize!r}'
@@ -187,13 +186,13 @@ def plan(
     if reward is None:
         reward = STANDARD if published else lexicographic()
     if exploration is None:
-        exploration = BOUNDED if isinstance(reward, Lexicographic) else 10.0
+        exploration = BOUNDED_EXPLORATION if isinstance(reward, Lexicographic) else EXPLORATION
     if chosen["focus"] is None:
         chosen = chosen | dict(focus=getattr(actions, "focus", 1.0))
     asked = dict(trees=trees, simulations=simulations, exploration=exploration) | chosen
     asked["widening"] = list(chosen["widening"])
     ready = prepare(method, key, sim, reward, actions, **asked)
-    prunes = min(prunes, levels(sim))  # a tree of so many roots is at an episode's end
+    prunes = min(counts["prunes"], levels(sim))  # a tree of so many roots is at an episode's end
     total = prunes * simulations
     if total >= 2**24:
         raise ValueError(
@@ -204,28 +203,36 @@ def plan(
     table = problem.settings.widths
     children = total + 1 if is_traced(table) else int(table.max())
     kept = "node" if memoize == "auto" else memoize
-    made = Plan(prunes, simulations, children, kept)
-    return Job(method, problem, made, trees, trees, ready.settings, ready.pilot)
+    return Job(
+        method=method,
+        problem=problem,
+        plan=Plan(prunes, simulations, children, kept),
+        trees=trees,
+        at_once=trees,
+        top=counts["top"],
+        settings=ready.settings,
+        calibration=ready.calibration,
+    )
 
 
-def enlist(
+def with_heads(
     job: Job,
     key: jax.Array,
     heads: Any,
     head_settings: HeadSettings | None,
-    chosen: dict[str, Any],
+    mode: str,
     memoize: str,
 ) -> Job:
     """The `Job` with heads that guide it; ValueError where these do not fit its settings."""
     if head_settings is None:
-        head_settings = HEAD_MODES.get(chosen["mode"], HEAD_MODES["default"])
+        head_settings = HEAD_MODES.get(mode, HEAD_MODES["default"])
     head_settings = check_settings(head_settings)
-    sim, actions = job.problem.sim, job.problem.choice.actions
+    sim, actions = job.sim, job.problem.choice.actions
     school = init_heads(jax.random.fold_in(key, job.trees), sim, actions, heads, head_settings)
-    if chosen["follow"] and school.value is not None:
+    if job.problem.choice.follow and school.value is not None:
         raise ValueError(
             f"{job.method}: follow must be False with a value head, since that judges each child"
-            f" by an action drawn for it, received True (mode={chosen['mode']!r})"
+            f" by an action drawn for it, received True (mode={mode!r})"
         )
     problem = job.problem._replace(guide=guide(school.heads, head_settings))
     learns = head_settings.train
@@ -256,13 +263,7 @@ def enlist(
 
 
 def grow_rounds(
-    job: Job,
-    key: jax.Array,
-    threads: int,
-    lanes: int,
-    top: int,
-    watch: Watch,
-    ways: units.Placement,
+    job: Job, key: jax.Array, threads: int, lanes: int, watch: Watch, ways: units.Placement
 ) -> tuple[units.UnitsRun, HeadTraining | None]:
     """Grow all trees, a round at a time, and teach the heads between two rounds.
 
@@ -270,22 +271,21 @@ def grow_rounds(
         job: what is to be grown.
         key: of the search.
         threads: that trees grow in.
-        lanes: trees in lockstep in each of them.
-        top: failures that the archive is to hold.
+        lanes: trees side by side in each of them.
         watch: is told of the simulations.
         ways: how groups of trees are run.
 
     Returns:
-        `jast.units.UnitsRun` with the harvests in the order of the trees, and the heads as they
+        `jast.units.UnitsRun` with the batches in the order of the trees, and the heads as they
         are now.
     """
-    problem, school, sim = job.problem, job.school, job.problem.sim
-    chunk = max(1, min(job.plan.simulations, HOST_CHUNK if runs_on_host(sim) else CHUNK))
+    problem, school, sim = job.problem, job.school, job.sim
+    chunk = max(1, min(job.plan.simulations, HOSTED_CHUNK if runs_on_host(sim) else CHUNK))
     words = np.asarray(jax.random.key_data(tree_keys(key, job.trees)))
     ran = units.UnitsRun((), 0)
     for first in range(0, job.trees, job.at_once):
         own = words[first : first + job.at_once]
-        turn = Round(problem, own, job.plan, lanes, chunk, max(256, 4 * top), first)
+        turn = Round(problem, own, job.plan, lanes, chunk, max(256, 4 * job.top), first)
         try:
             new = grow_all(turn, watch, ways, threads)
             ran = units.concatenate(ran, new)
@@ -304,7 +304,7 @@ def grow_rounds(
     return ran, school
 
 
-def _of_heads(heads: Any, job: Job) -> dict[str, Any]:
+def _settings_of_heads(heads: Any, job: Job) -> dict[str, Any]:
     """What a result's settings say of heads."""
     kind = heads
     if not isinstance(heads, str):

@@ -15,8 +15,10 @@ from jast.heads.heads import observation, policy_logits, predicted_value, sample
 __all__ = ["Guide", "child_value", "guide", "rolled"]
 
 
-# addresses apart from those of levels, and of what is drawn without heads
-_SHARE, _HEAD = jnp.uint32(1 << 31), jnp.uint32(1)
+_SHARE = jnp.uint32(1 << 31)
+"""Address apart from those of levels."""
+_HEAD = jnp.uint32(1)
+"""Address apart from that of what is drawn without heads."""
 
 
 @jax.tree_util.register_dataclass
@@ -45,23 +47,17 @@ def guide(heads, settings):
     they were never trained and may not guide so.
     """
     levels = jnp.where(settings.from_start, 2**30, jnp.asarray(heads.levels, jnp.int32))
-    on = levels > 0
-    number = lambda value, neutral: jnp.where(on, jnp.float32(value), jnp.float32(neutral))
-    weights = dict(
+    trained = levels > 0
+    made = Guide(
+        heads,
         power=jnp.float32(settings.power),
-        q_weight=number(settings.q_weight, 1),
-        v_weight=number(settings.v_weight, 0),
+        q_weight=jnp.where(trained, jnp.float32(settings.q_weight), jnp.float32(1)),
+        v_weight=jnp.where(trained, jnp.float32(settings.v_weight), jnp.float32(0)),
+        share=jnp.float32(settings.share),
+        levels=levels,
+        eager=settings.candidates == "all",
     )
-    return jax.tree.map(
-        jnp.asarray,
-        Guide(
-            heads,
-            share=jnp.float32(settings.share),
-            levels=levels,
-            eager=settings.candidates == "all",
-            **weights,
-        ),
-    )
+    return jax.tree.map(jnp.asarray, made)
 
 
 def rolled(guide, sim, actions, simulation, key, level, state, dist, otherwise):

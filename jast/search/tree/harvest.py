@@ -6,86 +6,84 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jast.episode import Episode, replay
-from jast.failures import collect, identity
+from jast.episode import Episode
+from jast.failures import identity
+from jast.search.driver import Log, finish, finish_traced
+from jast.search.lockstep import NEVER, Tally
 from jast.search.result import History, SearchResult, Trials
-from jast.search.tree.edges import Branches
 from jast.search.tree.layout import FAILURE, FRESH, INVALID, RAN
-from jast.search.tree.run import Harvest, Traced
+from jast.search.tree.run import Traced, TreeBatch
 
 __all__ = ["result", "traced_result"]
 
+MOMENTS = 200
+"""Of the history, at most."""
+SPARE = 8
+"""Distinct failures that are replayed beyond those that the archive keeps, as a few may no longer
+fail."""
 
-def result(
-    sim: Any, reward: Any, harvests: list[Harvest], settings: dict, top: int, school: Any
-) -> SearchResult:
-    """The `SearchResult` of ``harvests``; ``school``: what the heads learned, or None."""
+
+def result(search: Any, batches: list[TreeBatch], settings: dict, school: Any) -> SearchResult:
+    """The `SearchResult` of ``batches`` of a search (its ``sim``, ``reward`` and ``top``);
+    ``school``: what the heads learned, or None.
+    """
     log, outcome = (
-        np.concatenate([getattr(h, field) for h in harvests], axis=1)
+        np.concatenate([getattr(batch, field) for batch in batches], axis=1)
         for field in ("log", "outcome")
     )
-    has = lambda bit: (outcome & bit) > 0
-    ran, failed = has(RAN), has(FAILURE)
-    order = failed.reshape(-1)
-    episodes = int(ran.sum())
-    first = int(ran.reshape(-1)[: order.argmax() + 1].sum()) if order.any() else None
-    fresh_failure = failed & has(FRESH)
+    ran, failed, fresh = ((outcome & bit) > 0 for bit in (RAN, FAILURE, FRESH))
     value = np.where(ran, log, -np.inf)
-    per_tree = np.where(
-        fresh_failure.any(0), np.where(fresh_failure, value, -np.inf).max(0), value.max(0)
+    first = failed.reshape(-1).argmax()
+    tally = Tally(
+        episodes=int(ran.sum()),
+        steps=int(sum(batch.steps.astype(np.int64).sum() for batch in batches)),
+        failures=int(failed.sum()),
+        invalid=int(((outcome & INVALID) > 0).sum()),
+        first=int(ran.reshape(-1)[: first + 1].sum()) if failed.any() else NEVER,
+        failing=(failed & fresh).any(0),
     )
-    found = jax.tree.map(lambda *parts: np.concatenate(parts), *(h.found for h in harvests))
+    noted = Log(
+        tally=tally,
+        history=_history(value, failed & fresh, failed),
+        interrupted=None,
+        trials=_trials(batches, value, failed, fresh),
+    )
+    found = jax.tree.map(lambda *parts: np.concatenate(parts), *(b.found for b in batches))
     tree, simulation = (
-        np.concatenate([getattr(h, f) for h in harvests]) for f in ("tree", "simulation")
+        np.concatenate([getattr(b, field) for b in batches]) for field in ("tree", "simulation")
     )
-    chosen = _distinct(found, tree, simulation, top)
-    archive = collect(
-        sim,
-        reward,
-        _take(found, chosen),
-        tree[chosen],
-        simulation[chosen],
-        seen=int(failed.sum()),
-        top=top,
-    )
-    best = archive.best
-    if best is None:
-        best = _take(found, np.argmax(np.where(found.failure, -np.inf, found.reward)))
-    roots = jax.tree.map(lambda *parts: np.concatenate(parts, axis=1), *(h.roots for h in harvests))
-    return SearchResult(
-        best=jax.device_get(replay(sim, best, reward=reward)),
-        best_reward_per_tree=per_tree,
-        failures=archive,
-        episodes=episodes,
-        steps=int(sum(h.steps.astype(np.int64).sum() for h in harvests)),
-        first_failure=first,
-        failing_share=float(failed.sum() / max(episodes, 1)),
-        failing=int(failed.sum()),
-        failing_per_tree=fresh_failure.any(0),
-        history=_history(value, fresh_failure, failed),
-        invalid=int(has(INVALID).sum()),
-        trials=_trials(harvests, value, failed, has(FRESH)),
-        trees=_branches(harvests),
-        settings=settings,
-        roots=roots,
+    nearest = _take(found, np.argmax(np.where(found.failure, -np.inf, found.reward)))
+    rows = _distinct(found, tree, simulation, search.top)
+    where = dict(numbers=simulation[rows], trees=tree[rows])
+    done = finish(search, noted, nearest, _take(found, rows), settings=settings, **where)
+    return done._replace(
+        trees=_beside([b.branches for b in batches]),
+        roots=_beside([b.roots for b in batches]),
         heads=None if school is None else school.heads,
         lessons=() if school is None else school.lessons,
-        misses=_misses(harvests, top),
+        misses=_misses(batches, search.top),
     )
 
 
-def _misses(harvests: list[Harvest], top: int) -> Episode:
+def _beside(parts: list[Any]) -> Any:
+    """The arrays [n, trees, ...] of all batches; None where none were kept."""
+    if parts[0] == ():
+        return None
+    return jax.tree.map(lambda *arrays: np.concatenate(arrays, axis=1), *parts)
+
+
+def _misses(batches: list[TreeBatch], top: int) -> Episode:
     """The ``top`` best episodes of trees that found no failure, one a tree, by falling reward."""
-    own = [jax.tree.map(lambda a, h=h: a[: h.log.shape[1]], h.found) for h in harvests]
+    own = [jax.tree.map(lambda a, h=h: a[: h.log.shape[1]], h.found) for h in batches]
     best = jax.tree.map(lambda *parts: np.concatenate(parts), *own)
     rows = np.flatnonzero(~best.failure & np.isfinite(best.reward))
     return _take(best, rows[np.argsort(-best.reward[rows], kind="stable")][:top])
 
 
-def _trials(harvests: list[Harvest], value, failed, fresh) -> Trials | None:
-    if isinstance(harvests[0].trials, tuple):
+def _trials(batches: list[TreeBatch], value, failed, fresh) -> Trials | None:
+    if isinstance(batches[0].trials, tuple):
         return None
-    distance, log_prob = np.moveaxis(np.concatenate([h.trials for h in harvests], axis=2), 1, 0)
+    distance, log_prob = np.moveaxis(np.concatenate([h.trials for h in batches], axis=2), 1, 0)
     return Trials(
         value,
         np.where(fresh & np.isfinite(value), distance, np.inf),
@@ -94,13 +92,6 @@ def _trials(harvests: list[Harvest], value, failed, fresh) -> Trials | None:
         fresh,
         failed & ~fresh,
     )
-
-
-def _branches(harvests: list[Harvest]) -> Branches | None:
-    if not isinstance(harvests[0].branches, Branches):
-        return None
-    beside = lambda *parts: np.concatenate(parts, axis=1)
-    return jax.tree.map(beside, *(h.branches for h in harvests))
 
 
 def _distinct(found: Episode, tree, simulation, top: int) -> np.ndarray:
@@ -113,49 +104,37 @@ def _distinct(found: Episode, tree, simulation, top: int) -> np.ndarray:
             continue
         seen.add((tree[i], simulation[i]))
         names.add(identity(_take(found, i)))
-        if len(names) > top + 8:
+        if len(names) > top + SPARE:
             break
         chosen.append(i)
     return np.array(chosen, np.int64)
 
 
 def _history(value, failure, failed) -> History:
-    moments = np.unique(np.linspace(1, value.shape[0], min(value.shape[0], 200)).astype(int))
+    moments = np.unique(np.linspace(1, value.shape[0], min(value.shape[0], MOMENTS)).astype(int))
     best = np.maximum.accumulate(value, axis=0)[moments - 1]
     best_failure = np.maximum.accumulate(np.where(failure, value, -np.inf), axis=0)[moments - 1]
     best = np.where(np.maximum.accumulate(failure, axis=0)[moments - 1], best_failure, best)
     return History(moments, best, np.cumsum(failed.sum(1))[moments - 1])
 
 
-def traced_result(found: Traced) -> SearchResult:
+def traced_result(sim: Any, reward: Any, found: Traced) -> SearchResult:
     """The `SearchResult` of a traced search, of traced arrays."""
-    steps = found.first.shape[0]
-    failing = found.best.failure
-    score = jnp.where(
-        jnp.any(failing), jnp.where(failing, found.best.reward, -jnp.inf), found.best.reward
-    )
-    episodes = jnp.sum(found.episodes)
-    first = jnp.where(
-        jnp.any(found.failures > 0),
-        jnp.min(found.first) * steps + jnp.argmin(found.first).astype(jnp.int32) + 1,
-        -1,
-    )
-    failures = jnp.sum(found.failures)
-    return SearchResult(
-        best=jax.tree.map(lambda a: a[jnp.argmax(score)], found.best),
-        best_reward_per_tree=found.best.reward,
-        failures=None,
-        episodes=episodes,
+    (trees,) = found.first.shape
+    failing, rewards = found.best.failure, found.best.reward
+    score = jnp.where(failing | ~jnp.any(failing), rewards, -jnp.inf)
+    order = jnp.min(found.first) * trees + jnp.argmin(found.first).astype(jnp.int32) + 1
+    tally = Tally(
+        episodes=jnp.sum(found.episodes),
         steps=jnp.sum(found.steps),
-        first_failure=first,
-        failing_share=failures / jnp.maximum(episodes, 1),
-        failing_per_tree=failing,
-        history=None,
+        failures=jnp.sum(found.failures),
         invalid=jnp.sum(found.invalid),
-        settings=None,
-        failing=failures,
+        first=jnp.where(jnp.any(found.failures > 0), order, NEVER),
+        failing=failing,
     )
+    best = jax.tree.map(lambda a: a[jnp.argmax(score)], found.best)
+    return finish_traced(sim, reward, tally, best, rewards)
 
 
-def _take(episodes: Episode, i) -> Episode:
+def _take(episodes: Episode, i: Any) -> Episode:
     return Episode(*jax.tree.map(lambda a: a[i], tuple(episodes[:-1])))

@@ -11,7 +11,16 @@ from jast.outline import outline
 from jast.search.tree.packing import pack, shapes, unpack, width
 from jast.simulator import Simulator
 
-__all__ = ["Lead", "feed_level", "fed_of", "fed_or", "follows", "lead_of", "onward", "packed"]
+__all__ = [
+    "Lead",
+    "feed_level",
+    "fed_of",
+    "take_fed",
+    "follows",
+    "no_lead",
+    "update_lead",
+    "packed",
+]
 
 
 class Lead(NamedTuple):
@@ -43,24 +52,17 @@ class Lead(NamedTuple):
     """
 
 
-def lead_of(problem, lanes, levels, simulations, dtype):
+def no_lead(problem, lanes, levels, simulations, dtype):
     """The `Lead` of trees that have seen nothing, or ``()`` where the search wants none."""
     follow, feed = problem.choice.follow, problem.choice.feed
     if not (follow or feed):
         return ()
-    count, low = jnp.zeros((lanes,), jnp.int32), jnp.full((lanes,), -jnp.inf, dtype)
-    rows = lambda n: jnp.zeros((n, lanes), jnp.int32)
-    path = (
-        (count > 0, count, count, jnp.zeros_like(low), rows(levels + 1), rows(levels))
-        if follow
-        else ((),) * 6
-    )
-    fed = (
-        jnp.zeros((simulations + 1, lanes, 1 + width(_like(problem.sim))), jnp.uint32)
-        if feed
-        else ()
-    )
-    return Lead(low, count, *path, fed)
+    zero, low = jnp.zeros((lanes,), jnp.int32), jnp.full((lanes,), -jnp.inf, dtype)
+    trail = jnp.zeros((levels + 1, lanes), jnp.int32)
+    path = zero > 0, zero, zero, jnp.zeros_like(low), trail, trail[:-1]
+    words = 1 + width(_like(problem.sim))
+    fed = jnp.zeros((simulations + 1, lanes, words), jnp.uint32) if feed else ()
+    return Lead(low, zero, *(path if follow else ((),) * 6), fed)
 
 
 def follows(tree):
@@ -81,13 +83,13 @@ def fed_of(tree, simulation, lane):
     return fed if isinstance(fed, tuple) else fed[simulation, lane]
 
 
-def fed_or(sim, words, here, x):
+def take_fed(sim, words, here, x):
     """One lane: the disturbance that is fed, where there is one and ``here``; else ``x``."""
     there = here & (words[0] > 0)
     return jax.tree.map(lambda a, b: jnp.where(there, a, b), unpack(words[1:], _like(sim)), x)
 
 
-def onward(tree, walk, fresh, child, value, failed, i, middle):
+def update_lead(tree, walk, fresh, child, value, failed, i, middle):
     """The `Lead` after simulation ``i``, whose episodes earned ``value`` [B]; ``middle`` [B,
     words]: what their rollouts took at `feed_level`.
     """
@@ -96,25 +98,24 @@ def onward(tree, walk, fresh, child, value, failed, i, middle):
     # of failures only: following every better miss costs more finds than it brings
     if follows(tree):
         better &= failed
-    pick = lambda pred, new, old: jnp.where(pred, new, old)
     if follows(tree):
         moves = fresh & (better | lead.on)
         lane, new = jnp.arange(len(value), dtype=jnp.int32), jnp.zeros_like(lead.node) + i + 1
         lead = lead._replace(
             on=moves & ~child.done,
-            node=pick(moves, new, lead.node),
-            depth=pick(moves, walk.depth + 1, lead.depth),
-            reward=pick(moves, child.reward, lead.reward),
-            trail=pick(moves[None], walk.trail.at[walk.depth + 1, lane].set(new), lead.trail),
-            path=pick(moves[None], walk.path, lead.path),
+            node=jnp.where(moves, new, lead.node),
+            depth=jnp.where(moves, walk.depth + 1, lead.depth),
+            reward=jnp.where(moves, child.reward, lead.reward),
+            trail=jnp.where(moves[None], walk.trail.at[walk.depth + 1, lane].set(new), lead.trail),
+            path=jnp.where(moves[None], walk.path, lead.path),
         )
     if not isinstance(lead.fed, tuple):
         # thesis Algorithm 9: a* after this rollout
-        row = pick((better & (middle[:, 0] > 0))[:, None], middle, lead.fed[i])
+        row = jnp.where((better & (middle[:, 0] > 0))[:, None], middle, lead.fed[i])
         lead = lead._replace(fed=jax.lax.dynamic_update_slice_in_dim(lead.fed, row[None], i + 1, 0))
     return lead._replace(
-        value=pick(better, value, lead.value),
-        source=pick(better, jnp.zeros_like(lead.source) + i + 1, lead.source),
+        value=jnp.where(better, value, lead.value),
+        source=jnp.where(better, jnp.zeros_like(lead.source) + i + 1, lead.source),
     )
 
 

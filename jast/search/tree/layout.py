@@ -1,6 +1,6 @@
 """A batch of search trees as arrays.
 
-All trees advance in lockstep: simulation i runs in every tree at once. Arrays never leave their
+All trees advance side by side: simulation i runs in every tree at once. Arrays never leave their
 place: every write is a row, or a scatter whose index is out of range where there is nothing to
 write, and no tree array is an operand of a select.
 
@@ -30,11 +30,22 @@ from jast.outline import outline
 from jast.progress import advance, begin, blank, conclude
 from jast.rewards import once
 from jast.search.tree.guide import rolled
-from jast.search.tree.incumbent import fed_or, feed_level, follows, lead_of
+from jast.search.tree.incumbent import feed_level, follows, no_lead, take_fed
 from jast.search.tree.packing import pack
 from jast.simulator import Simulator, never
 
 __all__ = [
+    "CHILD",
+    "FAILURE",
+    "FRESH",
+    "INVALID",
+    "LINK",
+    "PAGE",
+    "RAN",
+    "RETURNS",
+    "REWARD",
+    "ROW",
+    "VISITS",
     "Node",
     "Problem",
     "Settings",
@@ -89,7 +100,7 @@ class Problem(NamedTuple):
         """Whether children have a v(s, a)."""
         return self.guide != () and self.guide.heads.value is not None
 
-    def onward(self, total, visits, before):
+    def q_value(self, total, visits, before):
         """Q(s, a), 0 where there are no visits: the mean of the returns ``total`` less what was
         paid ``before``, up to s; a reward of whole episodes pays nothing before the end.
         """
@@ -235,12 +246,12 @@ def most_lanes(pages):
     return (2**31 - 1 - ROW) // (pages * ROW)
 
 
-def make(problem, axes, keys, simulations, memoize="node", pages=None, record=False):
+def make(problem, keys, simulations, memoize="node", pages=None, record=False, axes=None):
     """Trees of one root each, with room for ``simulations`` in so many ``pages`` (default:
     `pages_of`).
 
-    ``axes`` says which parts of ``problem`` differ between trees (0) or not (None). ``record``:
-    `Tree.trials` are wanted.
+    ``axes`` says which parts of ``problem`` differ between trees (0) or not (None); None: none
+    does. ``record``: `Tree.trials` are wanted.
     """
     # Why axes: in a batch of searches (`jax.vmap`) some parameters differ from tree to tree; the
     # others, in most searches all, are held once and not once a tree.
@@ -269,7 +280,7 @@ def make(problem, axes, keys, simulations, memoize="node", pages=None, record=Fa
     first = jax.vmap(origin, in_axes=(axes, 0))(problem, keys)
     dtype = first.reward.dtype
     count = jnp.zeros((lanes,), jnp.int32)
-    lead = lead_of(problem, lanes, levels(problem.sim), simulations, dtype)
+    lead = no_lead(problem, lanes, levels(problem.sim), simulations, dtype)
     kept = first.state if memoize == "node" else ()
     node = Node(
         count,
@@ -374,7 +385,7 @@ def choose_rollout(problem, key, tree_key, level, state, fed=()):
             lambda: x,
         )
     if problem.choice.feed:
-        x = fed_or(sim, fed, level == feed_level(sim), x)
+        x = take_fed(sim, fed, level == feed_level(sim), x)
     return x0, x
 
 
@@ -397,6 +408,8 @@ def of_lanes(problem, axes, lane):
     """``problem`` with those of its leaves that differ between trees taken of these trees, [...];
     ``axes`` as in `make`.
     """
+    if axes is None:
+        return problem
     return jax.tree.map(
         lambda axis, leaf: leaf if axis is None else leaf[lane],
         axes,

@@ -11,7 +11,7 @@ from jast.outline import outline
 from jast.search.tree.layout import Problem, most_lanes, pages_of
 from jast.search.tree.run import Plan, bytes_per_tree
 
-__all__ = ["LANES", "fit", "keep"]
+__all__ = ["LANES", "fit", "require_rewards"]
 
 # in one thread: enough to fill vector units, few enough to stay near the processor
 LANES = 128
@@ -35,7 +35,7 @@ def fit(
         plan: with a memoization, which ``auto`` may change.
         trees: that are to grow at once.
         threads: that they grow in, or None for as many as there are processors.
-        lanes: trees in lockstep in a thread, or None for what is fast.
+        lanes: trees side by side in a thread, or None for what is fast.
         free: bytes that the trees in flight may take, or None for those that are free now.
         auto: whether states may be kept at roots only, where those of all nodes do not fit.
 
@@ -81,7 +81,7 @@ def fit(
     return plan, threads, max(1, min(lanes, within))
 
 
-def keep(method: str, sim: Any, simulations: int, record: bool) -> None:
+def require_rewards(method: str, sim: Any, simulations: int, record: bool) -> None:
     """ValueError where what is kept of all ``simulations`` does not fit, with the numbers."""
     real = outline(sim).dtype.itemsize
     # rewards and outcomes as harvested and joined, and the rewards of those that ran

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jax import lax
 
 from jast import results
+from jast.search.lockstep import select_lanes
 from jast.search.tree.incumbent import fed_of, follows
 from jast.search.tree.layout import (
     CHILD,
@@ -22,7 +23,7 @@ from jast.search.tree.layout import (
     node_shapes,
 )
 from jast.search.tree.packing import unpack
-from jast.search.tree.simulate import child_state, replay_to, select_lanes
+from jast.search.tree.simulate import child_state, replay_to
 
 __all__ = ["Roots", "prune", "recounted"]
 
@@ -49,7 +50,7 @@ class Roots(NamedTuple):
     """[B] bool: the tree was searching from this root."""
 
 
-def prune(problem, axes, tree, children, memoize="node"):
+def prune(problem, tree, children, memoize="node", axes=None):
     """Make the most visited child of each root the root (ties: the first made): the tree and the
     old roots' `Roots`.
 
@@ -59,9 +60,9 @@ def prune(problem, axes, tree, children, memoize="node"):
     root, level = tree.root, tree.depth
     searching = tree.alive & ~tree.ended
     state = _root_state(problem, axes, tree, memoize)
-    tree = _settle(tree)
+    tree = _add_turn(tree)
     rows, visits, total, child, reward = _children(tree, children)
-    q = problem.onward(total, visits, tree.root_reward[:, None])
+    q = problem.q_value(total, visits, tree.root_reward[:, None])
 
     slots, lane = jnp.arange(children, dtype=jnp.int32), jnp.arange(len(root), dtype=jnp.int32)
     source, fed = (), ()
@@ -72,9 +73,10 @@ def prune(problem, axes, tree, children, memoize="node"):
         )
         source = jnp.where(visits > 0, known, 0)
         fed = fed_of(tree, jnp.maximum(source - 1, 0), lane[:, None])
-    draw = lambda p, key, root, level, state, *of: jax.vmap(
-        lambda slot, *of: choose(p, key, root, slot, level, state, *of)
-    )(slots, *of)
+
+    def draw(p, key, root, level, state, *of):
+        return jax.vmap(lambda slot, *of: choose(p, key, root, slot, level, state, *of))(slots, *of)
+
     starts, actions = jax.vmap(draw, in_axes=(axes, 0, 0, 0, 0, 0, 0))(
         problem, tree.key, root, level, state, source, fed
     )
@@ -120,14 +122,14 @@ def recounted(problem, tree, roots, children, memoize="node"):
         node = tree.trail[root.depth, lane]
         reward = jax.vmap(lambda w: unpack(w, like).reward)(tree.nodes[node, lane])
         _, visits, total, *_ = _children(tree._replace(root=node), children)
-        q = problem.onward(total, visits, reward[:, None])
+        q = problem.q_value(total, visits, reward[:, None])
         count = jnp.where(root.valid[:, None], visits, 0).astype(jnp.int32)
         return root._replace(visits=count, q=q)
 
     return lax.map(one, roots)
 
 
-def _settle(tree):
+def _add_turn(tree):
     """The visits and returns of this turn, added to the edges above the root: the backup of
     Algorithm 1 goes to the first root.
     """
@@ -168,11 +170,9 @@ def _root_state(problem, axes, tree, memoize):
         (lanes,) = tree.key.shape
         like = node_shapes(tree, memoize)
         return jax.vmap(lambda w: unpack(w, like).state)(tree.nodes[tree.root, jnp.arange(lanes)])
-    return (
-        tree.base
-        if memoize == "root"
-        else replay_to(problem, axes, tree, tree.trail, tree.depth, memoize)[0]
-    )
+    if memoize == "root":
+        return tree.base
+    return replay_to(problem, axes, tree, tree.trail, tree.depth, memoize)[0]
 
 
 def _pick(array, index):

@@ -24,7 +24,7 @@ from jast.search.tree.packing import unpack
 __all__ = ["rebuild"]
 
 
-def rebuild(problem, axes, tree, lane, i, memoize="node"):
+def rebuild(problem, tree, lane, i, memoize="node", axes=None):
     """The episode of simulation ``i`` [n] of tree ``lane`` [n]: an `Episode` [n, ...] with the
     search's own reward, without states and true log p.
 

@@ -2,8 +2,8 @@
 watched and interrupted; or all in one traced program.
 """
 
-import functools
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -19,12 +19,12 @@ from jast.memory import size
 from jast.places import Task, UnitContext
 from jast.search.tree import simulate
 from jast.search.tree.edges import branches_of, edges_of
-from jast.search.tree.layout import FAILURE, FRESH, INVALID, RAN, make
+from jast.search.tree.layout import FAILURE, FRESH, INVALID, RAN, Problem, make
 from jast.search.tree.prune import prune, recounted
 from jast.search.tree.rebuild import rebuild
 from jast.watch import Watch
 
-__all__ = ["Harvest", "Plan", "Round", "bytes_per_tree", "grow_all", "grow_traced"]
+__all__ = ["Plan", "Round", "Traced", "TreeBatch", "bytes_per_tree", "grow_all", "grow_traced"]
 
 
 class Plan(NamedTuple):
@@ -48,14 +48,14 @@ class Plan(NamedTuple):
     """Whether the statistics of roots are those at the end of the tree, not of their turn."""
 
 
-class Harvest(NamedTuple):
+class TreeBatch(NamedTuple):
     """What is kept of a group of trees: B trees of S simulations."""
 
-    log: Any
+    log: np.ndarray
     """[S, B] reward of each simulation's episode."""
-    outcome: Any
+    outcome: np.ndarray
     """[S, B] bits FAILURE, FRESH, INVALID, RAN of `jast.search.tree.layout`."""
-    steps: Any
+    steps: np.ndarray
     """[B] simulator steps."""
     roots: Any
     """`Roots` with a leading axis [prunes], zeros from where all trees of the group are at their
@@ -63,9 +63,9 @@ class Harvest(NamedTuple):
     """
     found: Episode
     """[n] the best failing episodes, or the best ones of trees without failure."""
-    tree: Any
+    tree: np.ndarray
     """[n] where they were found."""
-    simulation: Any
+    simulation: np.ndarray
     edges: Any = ()
     """`Edges`, where the plan asks for them."""
     trials: Any = ()
@@ -74,61 +74,28 @@ class Harvest(NamedTuple):
     """`Branches`, where the plan asks for them."""
 
 
-@functools.partial(jit, static_argnames=("simulations", "memoize", "pages", "record"))
-def _make(problem, keys, simulations, memoize, pages=None, record=False):
-    return make(problem, _shared(problem), keys, simulations, memoize, pages, record)
-
-
-@functools.partial(jit, static_argnames=("memoize",), donate_argnames=("tree",))
-def _grow(problem, tree, begin_at, end_at, memoize):
-    return simulate.grow(problem, _shared(problem), tree, begin_at, end_at, memoize)
-
-
-@functools.partial(jit, static_argnames=("children", "memoize"), donate_argnames=("tree",))
-def _prune(problem, tree, children, memoize):
-    return prune(problem, _shared(problem), tree, children, memoize)
-
-
-@functools.partial(jit, static_argnames=("children", "memoize"))
-def _recounted(problem, tree, roots, children, memoize):
-    return recounted(problem, tree, roots, children, memoize)
-
-
-@functools.partial(jit, static_argnames=("children",))
-def _edges(problem, tree, children):
-    return edges_of(problem, _shared(problem), tree, children)
-
-
-@functools.partial(jit, static_argnames=("children",))
-def _branches(problem, tree, children):
-    return branches_of(problem, _shared(problem), tree, children)
-
-
-@functools.partial(jit, static_argnames=("memoize",))
-def _rebuild(problem, tree, lane, i, memoize):
-    return rebuild(problem, _shared(problem), tree, lane, i, memoize)
-
-
-def _shared(problem):
-    """`axes` of a problem that all trees share."""
-    return jax.tree.map(lambda _: None, problem)
+_make = jit(make, static_argnames=("simulations", "memoize", "pages", "record"))
+_grow = jit(simulate.grow, static_argnames=("memoize",), donate_argnames=("tree",))
+_prune = jit(prune, static_argnames=("children", "memoize"), donate_argnames=("tree",))
+_recounted = jit(recounted, static_argnames=("children", "memoize"))
+_edges = jit(edges_of, static_argnames=("children",))
+_branches = jit(branches_of, static_argnames=("children",))
+_rebuild = jit(rebuild, static_argnames=("memoize",))
 
 
 def bytes_per_tree(problem, plan):
     """Bytes that one tree takes while it grows, from the shapes of its arrays."""
     simulations = plan.prunes * plan.simulations
-    build = lambda p, keys: make(
-        p, _shared(p), keys, simulations, plan.memoize, plan.pages, plan.record
-    )
-    tree = jax.eval_shape(build, problem, tree_keys(jax.random.key(0), 2))
-    return size(tree) // 2
+    keys = tree_keys(jax.random.key(0), 2)
+    room = simulations, plan.memoize, plan.pages, plan.record
+    return size(_make.eval_shape(problem, keys, *room)) // 2
 
 
 class Round(NamedTuple):
     """What the groups of a round of trees have in common."""
 
-    problem: Any
-    words: Any
+    problem: Problem
+    words: np.ndarray
     """[trees, 2] uint32: those of the counter keys of the round; on the host."""
     plan: Plan
     lanes: int
@@ -142,16 +109,16 @@ class Round(NamedTuple):
 
 
 def grow_all(turn: Round, watch: Watch, ways: units.Placement, threads: int) -> units.UnitsRun:
-    """Grow one tree a key, a group of lanes at a time: `jast.units.UnitsRun` with a tuple of
-    `Harvest` in the order of the keys. ``watch`` counts simulations; an interruption ends all trees
-    at their next chunk.
+    """Grow one tree a key, a group of lanes at a time: `units.UnitsRun` with a tuple of
+    `TreeBatch` in the order of the keys. ``watch`` counts simulations; an interruption ends all
+    trees at their next chunk.
     """
     trees, lanes = len(turn.words), turn.lanes
     each = turn.plan.prunes * turn.plan.simulations
     return units.run(
         Task(_one_group, turn, lambda: _like(turn)),
         -(-trees // lanes),
-        lambda harvests, number, new: (*harvests, new),
+        lambda batches, number, new: (*batches, new),
         (),
         watch,
         ways._replace(name=f"trees-{turn.first}"),
@@ -161,7 +128,7 @@ def grow_all(turn: Round, watch: Watch, ways: units.Placement, threads: int) -> 
     )
 
 
-def _like(turn: Round) -> Harvest:
+def _like(turn: Round) -> TreeBatch:
     """The shapes of what `_one_group` returns."""
     problem, _, plan = turn[:3]
     keys = _keys(turn, np.zeros(turn.lanes, int))
@@ -170,7 +137,7 @@ def _like(turn: Round) -> Harvest:
     _, roots = _prune.eval_shape(problem, tree, plan.children, plan.memoize)
     rows = np.zeros(turn.candidates + turn.lanes, np.int32)
     found = _rebuild.eval_shape(problem, tree, rows, rows, plan.memoize)
-    return Harvest(
+    return TreeBatch(
         log=0,
         outcome=0,
         steps=0,
@@ -188,7 +155,7 @@ def _keys(turn: Round, rows: np.ndarray) -> jax.Array:
     return jax.random.wrap_key_data(turn.words[rows], impl=COUNTER)
 
 
-def _one_group(turn: Round, number: int, post: UnitContext) -> Harvest:
+def _one_group(turn: Round, number: int, post: UnitContext) -> TreeBatch:
     problem, words, plan, lanes, chunk, candidates, before = turn
     group = np.arange(number * lanes, min((number + 1) * lanes, len(words)))
     keys, group = _keys(turn, np.resize(group, lanes)), group + before
@@ -229,23 +196,21 @@ def _one_group(turn: Round, number: int, post: UnitContext) -> Harvest:
     if plan.recount:
         roots = jax.device_get(_recounted(problem, tree, roots, plan.children, plan.memoize))
     roots = jax.tree.map(lambda a: a[:, : len(group)], roots)
-    kept = lambda of: jax.tree.map(
-        lambda a: a[:, : len(group)], jax.device_get(of(problem, tree, plan.children))
-    )
-    edges = kept(_edges) if plan.edges else ()
-    branches = kept(_branches) if plan.branches else ()
+    edges = _edges(problem, tree, plan.children) if plan.edges else ()
+    branches = _branches(problem, tree, plan.children) if plan.branches else ()
+    edges, branches = jax.tree.map(lambda a: a[:, : len(group)], jax.device_get((edges, branches)))
     trials = np.asarray(tree.trials)[..., : len(group)] if plan.record else ()
-    return Harvest(
-        log,
-        outcome,
-        steps,
-        roots,
-        found,
-        group[lane].astype(np.int32),
-        i.astype(np.int32),
-        edges,
-        trials,
-        branches,
+    return TreeBatch(
+        log=log,
+        outcome=outcome,
+        steps=steps,
+        roots=roots,
+        found=found,
+        tree=group[lane].astype(np.int32),
+        simulation=i.astype(np.int32),
+        edges=edges,
+        trials=trials,
+        branches=branches,
     )
 
 
@@ -265,11 +230,11 @@ class Traced(NamedTuple):
     """What a traced search knows of each tree, [B]."""
 
     best: Episode
-    failures: Any
-    episodes: Any
-    steps: Any
-    invalid: Any
-    first: Any
+    failures: jax.Array
+    episodes: jax.Array
+    steps: jax.Array
+    invalid: jax.Array
+    first: jax.Array
     """The first failing simulation, or S."""
 
 
@@ -325,28 +290,32 @@ def _batchable(treedef: Any, plan: Plan, axes: tuple) -> Callable[..., Traced]:
 
 
 def _traced(problem, axes, keys, plan):
-    tree = make(problem, axes, keys, plan.prunes * plan.simulations, plan.memoize, plan.pages)
+    room = plan.prunes * plan.simulations, plan.memoize, plan.pages
+    tree = make(problem, keys, *room, axes=axes)
 
     def turn(n, tree):
-        tree = simulate.grow(
-            problem, axes, tree, n * plan.simulations, (n + 1) * plan.simulations, plan.memoize
-        )
-        return prune(problem, axes, tree, plan.children, plan.memoize)[0]
+        ends = n * plan.simulations, (n + 1) * plan.simulations
+        tree = simulate.grow(problem, tree, *ends, plan.memoize, axes)
+        return prune(problem, tree, plan.children, plan.memoize, axes)[0]
 
     tree = lax.fori_loop(0, plan.prunes, turn, tree)
-    has = lambda bit: (tree.outcome & bit) > 0
-    failing = has(FRESH) & has(FAILURE)
-    value = jnp.where(
-        has(FRESH) & jnp.where(jnp.any(failing, axis=0), failing, True), tree.log, -jnp.inf
-    )
+    fresh, failed, ran, invalid = ((tree.outcome & b) > 0 for b in (FRESH, FAILURE, RAN, INVALID))
+    failing = fresh & failed
+    counts = fresh & (failing | ~jnp.any(failing, axis=0)[None])
+    value = jnp.where(counts, tree.log, -jnp.inf)
     best = jnp.argmax(value, axis=0).astype(jnp.int32)
     lane = jnp.arange(keys.shape[0], dtype=jnp.int32)
-    found = rebuild(problem, axes, tree, lane, best, plan.memoize)
-    count = lambda bit: jnp.sum(has(bit), axis=0, dtype=jnp.int32)
-    first = jnp.where(
-        jnp.any(has(FAILURE), axis=0), jnp.argmax(has(FAILURE), axis=0), tree.log.shape[0]
-    ).astype(jnp.int32)
+    found = rebuild(problem, tree, lane, best, plan.memoize, axes)
+    first = jnp.where(jnp.any(failed, axis=0), jnp.argmax(failed, axis=0), len(tree.log))
+    count = partial(jnp.sum, axis=0, dtype=jnp.int32)
     exact = jax.vmap(
         lambda p, e: play_back(p.sim, p.reward, e.x0, e.disturbances, e.length), in_axes=(axes, 0)
     )(problem, found)
-    return Traced(exact, count(FAILURE), count(RAN), tree.steps, count(INVALID), first)
+    return Traced(
+        best=exact,
+        failures=count(failed),
+        episodes=count(ran),
+        steps=tree.steps,
+        invalid=count(invalid),
+        first=first.astype(jnp.int32),
+    )

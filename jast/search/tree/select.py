@@ -79,9 +79,9 @@ def select(problem, tree):
     first = jnp.minimum(tree.depth[0], 0)
 
     def of_node(visits):
-        width = lambda n: (
-            settings.widths[n] if settings.widths.ndim == 1 else settings.widths[lane, n]
-        )
+        def width(n):
+            return settings.widths[n if settings.widths.ndim == 1 else (lane, n)]
+
         count = width(visits)
         grows = width(visits + 1) > count if eager else ()
         return count, grows, exploration * jnp.sqrt(jnp.log(visits.astype(dtype)))
@@ -92,7 +92,8 @@ def select(problem, tree):
         desk = lax.dynamic_update_slice_in_dim(w.desk, rows[None], first, 0)
         return desk, desk[0]
 
-    number = lambda a: jnp.asarray(a, dtype).reshape(-1, 1)  # of all trees or of each
+    def number(a):  # of all trees or of each
+        return jnp.asarray(a, dtype).reshape(-1, 1)
 
     def pick(row, column, j):
         return jnp.take_along_axis(row, (column + j)[:, None], axis=1, mode="promise_in_bounds")[
@@ -102,7 +103,7 @@ def select(problem, tree):
     def body(w):
         desk, row = read(w)
         n, total = row[:, VISITS:RETURNS], row[:, RETURNS:CHILD]
-        q = problem.onward(total, n, w.reward[:, None])
+        q = problem.q_value(total, n, w.reward[:, None])
         if valued:
             values = lax.dynamic_update_slice_in_dim(
                 w.values, tree.values.reshape(-1, PAGE + 1)[w.row][None], first, 0

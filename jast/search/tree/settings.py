@@ -12,21 +12,23 @@ from jast._jax import is_traced
 from jast.search.tree.choice import Choice
 from jast.search.tree.layout import Problem, Settings, widths
 
-__all__ = ["PLAIN", "problem_of", "settled"]
+__all__ = ["CHOICES", "PLAIN", "mode_settings", "problem_of"]
 
 SWITCHES = ("spread", "follow", "feed", "urgent")
+CHOICES = ("widening", "focus", *SWITCHES)
+"""The settings of a mode."""
 PLAIN = dict(spread=False, focus=1.0, follow=False, feed=False, urgent=False)
 """The settings of a mode that adds nothing to the published search."""
 
 
-def settled(
+def mode_settings(
     method: str, modes: Mapping[str, dict], mode: str, actions: Any, **given: Any
 ) -> dict[str, Any]:
     """The settings of a mode, checked.
 
     Args:
         method: the search, for messages.
-        modes: name of a mode -> its settings: ``widening``, ``focus`` and the ``SWITCHES``.
+        modes: name of a mode -> its `CHOICES`.
         mode: which one.
         actions: of `jast.actions`, which say how near to the mode a ``focus`` of None draws; it
             stays None with actions of None.
@@ -61,7 +63,7 @@ def settled(
 def problem_of(
     sim: Any, reward: Any, actions: Any, chosen: Mapping[str, Any], exploration: Any, total: int
 ) -> Problem:
-    """The `Problem` of trees of ``total`` simulations by the settings ``chosen`` (of `settled`)."""
+    """The `Problem` of trees of ``total`` simulations by ``chosen`` (`mode_settings`)."""
     focus = chosen["focus"]
     choice = Choice(
         actions,

@@ -5,7 +5,8 @@ import jax.numpy as jnp
 from jax import lax
 
 from jast.progress import Progress, blank, conclude
-from jast.search.tree.incumbent import Lead, fed_of, feed_level, follows, onward, packed
+from jast.search.lockstep import select_lanes
+from jast.search.tree.incumbent import Lead, fed_of, feed_level, follows, packed, update_lead
 from jast.search.tree.layout import (
     CHILD,
     FAILURE,
@@ -28,12 +29,12 @@ from jast.search.tree.layout import (
 )
 from jast.search.tree.packing import pack, unpack
 from jast.search.tree.select import select
-from jast.search.tree.values import foresee
+from jast.search.tree.values import evaluate_children
 
-__all__ = ["child_state", "grow", "replay_to", "select_lanes"]
+__all__ = ["child_state", "grow", "replay_to"]
 
 
-def grow(problem, axes, tree, begin_at, end_at, memoize="node"):
+def grow(problem, tree, begin_at, end_at, memoize="node", axes=None):
     """Run simulations ``begin_at`` .. ``end_at - 1`` in every tree (traced: one program for any
     number); none where all trees are at their end.
     """
@@ -52,7 +53,9 @@ def _simulation(problem, axes, tree, i, memoize):
     zero = jnp.zeros((lanes,), tree.edges.dtype)
     recorded, episodic = not isinstance(tree.trials, tuple), problem.sim.episodic
     source = jnp.where(tree.lead.on & fresh, tree.lead.source, 0) if follows(tree) else ()
-    thin = lambda progress: progress if recorded else progress._replace(log_prob=zero)
+
+    def without_log_p(progress):
+        return progress if recorded else progress._replace(log_prob=zero)
 
     def expand():
         """The new child of each tree; and the node it is a child of, or the episode's end that
@@ -85,14 +88,20 @@ def _simulation(problem, axes, tree, i, memoize):
             problem, tree.key, walk.node, walk.best.slot, walk.depth, before, *of
         )
         known = node.reward, node.failure, node.invalid, (node.distance, so_far) if recorded else ()
-        return desk, thin(child), replayed, known, fed_of(tree, jnp.zeros_like(lane) + i, lane)
+        return (
+            desk,
+            without_log_p(child),
+            replayed,
+            known,
+            fed_of(tree, jnp.zeros_like(lane) + i, lane),
+        )
 
     # in a conditional, so that all reads of the tree are over before the first write: otherwise XLA
     # copies the tree
-    nobody = lambda: (
-        tree.desk,
-        *jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), jax.eval_shape(expand)[1:]),
-    )
+    def nobody():
+        blanks = jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), jax.eval_shape(expand)[1:])
+        return tree.desk, *blanks
+
     desk, child, replayed, (known_reward, known_failure, known_invalid, known_trial), fed = (
         lax.cond(jnp.any(tree.alive), expand, nobody)
     )
@@ -115,7 +124,7 @@ def _simulation(problem, axes, tree, i, memoize):
             here = live & (level == middle)
             taken = jnp.where(here[:, None], jax.vmap(packed)(here, x), taken)
         state = select_lanes(live, after.state, at.state) if episodic else after.state
-        return level + 1, steps + _one(live), thin(kept._replace(state=state)), taken
+        return level + 1, steps + _one(live), without_log_p(kept._replace(state=state)), taken
 
     # a random start is a level, but no step
     steps = _one(fresh & (walk.depth >= levels(problem.sim) - problem.sim.horizon))
@@ -175,7 +184,7 @@ def _simulation(problem, axes, tree, i, memoize):
         outcome=lax.dynamic_update_slice_in_dim(tree.outcome, bits[None], i, 0),
         alive=tree.alive & ~tree.ended,
         lead=(
-            onward(tree, walk, fresh, child, value, failed, i, taken)
+            update_lead(tree, walk, fresh, child, value, failed, i, taken)
             if isinstance(tree.lead, Lead)
             else ()
         ),
@@ -187,7 +196,7 @@ def _simulation(problem, axes, tree, i, memoize):
     )
     if not problem.values:
         return tree
-    return foresee(
+    return evaluate_children(
         problem,
         axes,
         tree,
@@ -288,11 +297,6 @@ def child_state(problem, tree_key, parent, slot, level, state, source=(), fed=()
     return _child(
         problem, tree_key, parent, slot, level, blank(problem.sim, state), source, fed
     ).state
-
-
-def select_lanes(pred, a, b):
-    """Leaves [B, ...] of ``a`` where ``pred`` [B], else of ``b``."""
-    return jax.tree.map(lambda x, y: jax.vmap(jnp.where)(pred, x, y), a, b)
 
 
 def _one(pred):

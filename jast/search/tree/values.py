@@ -19,10 +19,10 @@ from jast.search.tree.layout import (
 )
 from jast.search.tree.packing import unpack
 
-__all__ = ["foresee"]
+__all__ = ["evaluate_children"]
 
 
-def foresee(problem, axes, tree, walk, fresh, replay, memoize):
+def evaluate_children(problem, axes, tree, walk, fresh, replay, memoize):
     """Give children their v(s, a) before a selection sees them, and pages to stand on: the tree.
 
     With ``guide.eager``, of every node of the path the child that its next visit will find; else of
@@ -85,10 +85,7 @@ def foresee(problem, axes, tree, walk, fresh, replay, memoize):
         else:
             state, taken = replay(column, level, live)
             steps = steps.at[jnp.where(live, column, lanes)].add(taken, mode="drop")
-        choose = lambda p, key, slot, state: child_value(
-            p.guide, p.sim, state, choose_child(p, key, slot, state)[1]
-        )
-        v = jax.vmap(choose, in_axes=(axes, 0, 0, 0))(
+        v = jax.vmap(_value, in_axes=(axes, 0, 0, 0))(
             of_lanes(problem, axes, column), node_keys(tree.key[column], node), slot, state
         )
         # the level of a random start has no value: all its children score 0
@@ -108,3 +105,8 @@ def foresee(problem, axes, tree, walk, fresh, replay, memoize):
         lambda c: c[0] < total, some, (jnp.int32(0), tree.edges, tree.values, tree.steps)
     )
     return tree._replace(edges=edges, values=values, pages=tree.pages + rank[-1], steps=steps)
+
+
+def _value(problem, node_key, slot, state):
+    _, x = choose_child(problem, node_key, slot, state)
+    return child_value(problem.guide, problem.sim, state, x)
