@@ -29,7 +29,7 @@ from jast.estimate import (
     trace_proposal,
 )
 from jast.estimate.importance_sampling import LANES, chunk_size, chunks, draw_episodes
-from jast.policy import Policy, nominal_policy, recorded
+from jast.policy import Policy, nominal_policy
 from jast.simulators import landing, landing_probability, walk1d
 from jast.watch import Watch
 
@@ -50,6 +50,13 @@ def most_probable(sign=1.0, b=1.0):
         landing(b),
         jnp.full(10, sign * b * SHIFT * 1.0001),
         x0=jnp.asarray(sign * b * START * 1.0001),
+    )
+
+
+def recorded(disturbances):
+    """A policy that plays back ``disturbances`` [T]; the last one stays."""
+    return Policy(
+        D.Fixed, lambda s, t: D.Deterministic(disturbances[jnp.minimum(t, len(disturbances) - 1)])
     )
 
 

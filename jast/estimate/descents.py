@@ -317,13 +317,13 @@ def _expected_steps(d, width, settings):
 
 
 def cool_failures(
-    key: jax.Array, sim: Simulator, points: np.ndarray, evaluations: int, resample: bool
+    key: jax.Array, sim: Simulator, points: np.ndarray, evaluations: int, replace: bool
 ) -> tuple[np.ndarray, int]:
     """The failures ``points`` [m, D] cooled to the likeliest, for so many ``evaluations``, nearly,
     and how many they were.
 
-    Unless they ``resample`` no point replaces another, so no mode is lost, however little of the
-    probability it has. Else those of high density replace the others at each width, as in every
+    Without ``replace`` no point takes another's place, so no mode is lost, however little of the
+    probability it has. With it those of high density replace the others at each width, as in every
     population, and moves are spent where failures are likeliest.
     """
     m, rng = len(points), numpy_generator(key, 6)
@@ -336,7 +336,7 @@ def cool_failures(
     moves = max(evaluations // (m * SETTINGS.cooling_steps), 2)
     widths = np.geomspace(1.0, SETTINGS.final_width, SETTINGS.cooling_steps).tolist()
     for i, width in enumerate(widths):
-        if resample and i:
+        if replace and i:
             square = np.asarray(particles.square)[:m].astype(np.float64)
             used, last = np.asarray(particles.used)[:m], widths[i - 1]
             # as far on the way to this width as leaves enough effective points

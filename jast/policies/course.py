@@ -145,7 +145,6 @@ def _learn(method, plan, kept, auto_scale, progress, callback, store):
         progress,
         callback,
         done=int(kept[0].step) * lanes,
-        former=lambda done, total, h: (int(h.episodes[-1]), jax.tree.map(lambda a: a[-1], h)),
     )
     try:
         with terminable():
