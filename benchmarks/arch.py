@@ -21,7 +21,7 @@ import jast
 from benchmarks import arch_flights, arch_probability, peers
 from benchmarks.cma_es import Stop
 from benchmarks.sizes import add_choices, installed, options, print_report, size
-from jast import limit_state
+from jast._src.normal_space import transform
 from jast.simulators.arch import automatic_transmission, chasing_cars, ground_collision_avoidance
 
 __all__ = ["METHODS", "run"]
@@ -93,11 +93,11 @@ def _peer(name):
             if failed:
                 raise Stop
             z = jax.scipy.special.ndtri(jnp.clip(jnp.asarray(u), 1e-6, 1 - 1e-6))
-            o = jax.device_get(limit_state.outcomes(sim, z[None]))
+            o = jax.device_get(transform.outcomes(sim, z[None]))
             failed = bool(o.failure[0])
             return -1.0 if failed else float(o.distance[0])
 
-        seed, d = int(jax.random.key_data(key)[-1]), limit_state.dimension(sim)
+        seed, d = int(jax.random.key_data(key)[-1]), transform.dimension(sim)
         middle, sd = np.full(d, 0.5), np.full(d, 0.25)
         _, value = peers.PEERS[name](seed, objective, middle, sd, budget)
         return len(value) if failed else None

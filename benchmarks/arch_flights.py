@@ -7,8 +7,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jast.simulators.arch import gcas
-from jast.simulators.arch.flights import BOX
+from jast._src.simulators.arch import gcas
+from jast._src.simulators.arch.flights import BOX
 
 __all__ = ["rows", "table"]
 

@@ -26,9 +26,9 @@ from benchmarks.sizes import (
     size,
     timed,
 )
-from jast.counter import tree_keys
-from jast.intervals import clopper_pearson
-from jast.simulators.colav import SCENARIOS, colav
+from jast._src.core.counter_prng import tree_keys
+from jast._src.simulators.colav import SCENARIOS, colav
+from jast._src.util.intervals import clopper_pearson
 
 REWARD = jast.rewards.standard(event_bonus=200.0, density="mode")
 PRUNES = 22  # published
@@ -139,7 +139,7 @@ def memoization(
 
 def picture(rows, path):
     """Figure 5 of the paper, measured: the CPU time of a simulation by the substeps of a step."""
-    from jast.plot import style
+    from jast._src.plot import style
 
     labels = {
         "MCTS-SA": "MCTS-SA, full simulations",

@@ -12,9 +12,9 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from jast.intervals import clopper_pearson
-from jast.plot import style
-from jast.search.result import SearchResult
+from jast._src.plot import style
+from jast._src.search.result import SearchResult
+from jast._src.util.intervals import clopper_pearson
 
 COSTS = np.geomspace(1e-8, 1.0, 33)
 """Seconds."""

@@ -19,7 +19,7 @@ from benchmarks.cases import CASES
 from benchmarks.engine import cpu
 from benchmarks.sizes import options, print_report, printer, size, timed
 from jast import cross_entropy as ce
-from jast.cross_entropy.surrogates import RADIAL
+from jast._src.cross_entropy.surrogates import RADIAL
 
 SIERRA = ("sierra 1A", "sierra 1B", "sierra 1C")
 METHODS = ("ce_method", "ce_surrogate", "ce_mixture")
@@ -293,7 +293,7 @@ def picture(path, report):
 
     matplotlib.use("Agg")
     from jast import plot
-    from jast.plot import style
+    from jast._src.plot import style
 
     shown = {
         "CE-method": ("ce_method", "thesis"),

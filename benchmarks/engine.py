@@ -30,14 +30,14 @@ from benchmarks.sizes import (
     size,
     timed,
 )
-from jast.counter import tree_keys
-from jast.progress import Progress, begin
+from jast._src.core.counter_prng import tree_keys
+from jast._src.core.simulator import Simulator
+from jast._src.core.transition import Progress, begin
+from jast._src.search.forest import MODES
+from jast._src.search.tree import run
+from jast._src.search.tree.layout import choose_rollout, take
+from jast._src.search.tree.settings import mode_settings, problem_of
 from jast.rewards import as_pytree
-from jast.search.forest import MODES
-from jast.search.tree import run
-from jast.search.tree.layout import choose_rollout, take
-from jast.search.tree.settings import mode_settings, problem_of
-from jast.simulator import Simulator
 
 REWARD = jast.rewards.standard(event_bonus=30.0, density="mode")
 BOX = jast.actions.uniform(0.0, 1.0)

@@ -25,10 +25,10 @@ import jast
 from benchmarks.limit_states import DYNAMIC, LIMITS, Limit
 from benchmarks.literature import CASES as LITERATURE
 from benchmarks.sizes import add_choices, options, print_report, printer, size, timed
-from jast import limit_state as latent
+from jast._src.estimate.host_populations import equilibrate
+from jast._src.normal_space import transform as latent
+from jast._src.normal_space.evaluate_points import judged
 from jast.estimate import failure_probability, failure_samples
-from jast.estimate.populations import equilibrate
-from jast.judge import judged
 
 __all__ = ["density_and_coverage", "run"]
 

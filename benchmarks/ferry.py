@@ -16,7 +16,7 @@ import numpy as np
 
 import jast
 from benchmarks.sizes import options, print_report, printer, size, timed
-from jast.intervals import clopper_pearson
+from jast._src.util.intervals import clopper_pearson
 
 DATA = pathlib.Path(__file__).resolve().parents[2] / "shared" / "data" / "ferry"
 REWARD = jast.rewards.standard(event_bonus=30.0, density="mode")

@@ -21,10 +21,10 @@ from jax.tree_util import Partial
 from benchmarks.limit_states import four_branch, four_branch_probability
 from benchmarks.probability import summary
 from benchmarks.sizes import add_choices, options, print_report, printer, size, timed
+from jast._src.core.simulator import Simulator
 from jast.blackbox import from_python
 from jast.distributions import Joint, MultivariateNormalDiag, Normal, TruncatedNormal
 from jast.estimate import failure_probability
-from jast.simulator import Simulator
 from jast.simulators import limit_state
 
 __all__ = ["SYSTEMS", "System", "metaballs"]

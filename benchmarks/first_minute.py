@@ -34,9 +34,9 @@ from benchmarks.sizes import (
     printer,
     size,
 )
-from jast import _jax
+from jast._src.normal_space.transform import dimension, outcome
+from jast._src.runtime import _jax
 from jast.distributions import Normal
-from jast.limit_state import dimension, outcome
 
 __all__ = ["SYSTEMS", "calls"]
 
@@ -122,7 +122,7 @@ def calls(name: str, least: bool) -> list[dict[str, float]]:
 
 def ways(make: Callable) -> list[tuple[float, float]]:
     """(CPU seconds to compile, microseconds an episode) of a program that plays `LANES` episodes
-    side by side: as JAX does, as `jast._jax` does briefly, and quickly.
+    side by side: as JAX does, as `runtime._jax` does briefly, and quickly.
     """
     sim = make()
     z = jax.random.normal(jax.random.key(0), (LANES, dimension(sim)))

@@ -12,7 +12,7 @@ import jax
 import jast
 from benchmarks.sizes import in_fresh_process, options, print_report, printer, size, timed
 from benchmarks.stress_systems import CASES, TUNED
-from jast import memory
+from jast._src.runtime import memory
 from jast.simulators import ferry
 
 __all__ = ["main"]

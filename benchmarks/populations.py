@@ -15,8 +15,8 @@ import numpy as np
 
 from benchmarks.sizes import options, print_report, printer, size
 from benchmarks.time_to_answer import SYSTEMS
-from jast.estimate.descents import DESCENTS, SETTINGS
-from jast.estimate.particles import SMALL, WINDOW
+from jast._src.estimate.population.descents import DESCENTS, SETTINGS
+from jast._src.estimate.population.particle_moves import SMALL, WINDOW
 
 __all__ = ["CHANGES", "work"]
 

@@ -28,8 +28,9 @@ from benchmarks.literature import literature_cases
 from benchmarks.markov_systems import markov_cases
 from benchmarks.sizes import add_choices, options, print_report, printer, size, timed
 from benchmarks.structural import structural_cases
+from jast._src.core.policy import Policy
+from jast._src.distributions.mixtures import blend
 from jast.distributions import Normal
-from jast.distributions.mixtures import blend
 from jast.estimate import (
     clopper_pearson,
     failure_probability,
@@ -37,7 +38,6 @@ from jast.estimate import (
     policy_proposal,
     trace_proposal,
 )
-from jast.policy import Policy
 
 LANDING = 4.0236721906842e-13
 TRUTHS = {"landing": LANDING, "pendulum": 8.169e-3}

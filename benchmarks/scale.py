@@ -31,9 +31,10 @@ import numpy as np
 
 import jast
 from benchmarks.sizes import options, print_report, size, timed
-from jast import places, units
+from jast._src.runtime import backends
+from jast._src.runtime import work as units
+from jast._src.runtime.checkpoints import PARTS, read_records
 from jast.blackbox import from_python
-from jast.checkpoints import PARTS, read_records
 from jast.distributions import Normal
 from jast.simulators import ferry, landing
 from jast.weakness import default
@@ -90,9 +91,9 @@ def chains():
 
 
 def plain(task, n, fold, state, watch, ways=units.HERE, **_):
-    """`jast.units.run` as a loop: without threads, checkpoints and interrupts."""
+    """`runtime.work.run` as a loop: without threads, checkpoints and interrupts."""
     for number in range(n):
-        result = jax.device_get(task.function(task.shared, number, places.UnitContext()))
+        result = jax.device_get(task.function(task.shared, number, backends.UnitContext()))
         state = fold(state, number, result)
     return units.UnitsRun(state, n)
 

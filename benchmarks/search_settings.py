@@ -1,4 +1,4 @@
-"""The numbers of the search for a proposal (`jast.estimate.search_settings`), each halved and
+"""The numbers of the search for a proposal (`estimate.proposal_search.settings`), each halved and
 doubled: ``python -m benchmarks.search_settings [--json] [--quick | --smoke] [--only NUMBER ...]``.
 
 Problems are drawn by seed (`benchmarks.limit_states`). For each number: how many estimates are
@@ -14,8 +14,8 @@ import jax
 import jast
 from benchmarks.limit_states import FAMILIES, draw
 from benchmarks.sizes import add_choices, options, print_report, printer, size
-from jast.estimate import by_proposal
-from jast.estimate.search_settings import SETTINGS
+from jast._src.estimate.proposal_search import by_proposal
+from jast._src.estimate.proposal_search.settings import SETTINGS
 
 SHARES = (
     "exploration_end",

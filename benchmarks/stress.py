@@ -22,13 +22,14 @@ import jast
 from benchmarks import cma_es as driver
 from benchmarks.sizes import add_choices, installed, options, print_report, size
 from benchmarks.stress_systems import CASES, JUDGED, LOOPS
-from jast.estimate.batches import resample
-from jast.estimate.descents import SETTINGS, cool_failures
-from jast.failures import empty
-from jast.limit_state import dimension, normal_numbers, policy_of
+from jast._src.core.failures import empty
+from jast._src.estimate.population.descents import SETTINGS, cool_failures
+from jast._src.estimate.proposal_search.mixture_draws import resample
+from jast._src.normal_space.mode_coordinates import centred
+from jast._src.normal_space.transform import dimension, normal_numbers, policy_of
+from jast._src.stress_testing import explorers
+from jast._src.stress_testing import stress as portfolio
 from jast.rewards import likelihood
-from jast.search.centred import centred
-from jast.stress_testing import explorers, portfolio
 
 __all__ = ["METHODS", "run"]
 

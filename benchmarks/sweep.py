@@ -24,10 +24,10 @@ import jast
 from benchmarks.closed_loops import system
 from benchmarks.sizes import options, print_report, printer, size, timed
 from benchmarks.stress_systems import lane
+from jast._src.normal_space.evaluate_points import judged
+from jast._src.normal_space.transform import dimension
 from jast.distributions import Normal
 from jast.estimate import failure_probability
-from jast.judge import judged
-from jast.limit_state import dimension
 
 __all__ = ["run"]
 

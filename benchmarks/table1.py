@@ -16,9 +16,9 @@ import jast
 from benchmarks import engine
 from benchmarks.ferry import BOX, REWARD, TABLE, data, golden, outcome
 from benchmarks.sizes import print_report, printer, size, timed
-from jast.counter import tree_keys
-from jast.intervals import clopper_pearson
-from jast.search.tree.memory import LANES
+from jast._src.core.counter_prng import tree_keys
+from jast._src.search.tree.memory import LANES
+from jast._src.util.intervals import clopper_pearson
 
 VARIANTS = {"-/-": None, "MCTS-SA": None, "RP/-": "rollout", "-/VN": "value", "RP/VN": "both"}
 HEADS = {"none": None, "rollout": "rollout", "value": "value", "both": "both"}
@@ -302,7 +302,7 @@ def draw(out, path):
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    from jast.plot.style import COLOURS, styled
+    from jast._src.plot.style import COLOURS, styled
 
     with styled():
         figure, (left, right) = plt.subplots(1, 2, figsize=(9.6, 3.9), layout="constrained")

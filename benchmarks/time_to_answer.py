@@ -22,8 +22,8 @@ from jax.tree_util import Partial
 import jast
 from benchmarks.closed_loops import JUDGED, RARE, TUNED, system
 from benchmarks.sizes import add_choices, options, percent, print_report, printer, size
-from jast.judge import judged
-from jast.limit_state import dimension
+from jast._src.normal_space.evaluate_points import judged
+from jast._src.normal_space.transform import dimension
 from jast.simulators import limit_state
 
 __all__ = ["SYSTEMS", "System", "plain_draws", "row_of"]
@@ -151,7 +151,7 @@ def answers(method: str, about: System, seed: int) -> tuple[Any, float]:
 
 def _subset(about, seed):
     """OpenTURNS's subset simulation with 10,000 points a level, as it comes; the system runs in the
-    program of `jast.judge`.
+    program of `normal_space.evaluate_points`.
     """
     import openturns as ot
 

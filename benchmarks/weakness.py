@@ -31,9 +31,9 @@ from sklearn.neural_network import MLPClassifier
 from benchmarks.fms import mean
 from benchmarks.sizes import options, print_report, printer, size, timed
 from jast import plot, weakness
-from jast.weakness.measures import precision_recall
-from jast.weakness.thesis import draw_halves
-from jast.weakness.validation import iteration_key
+from jast._src.weakness.measures import precision_recall
+from jast._src.weakness.thesis_selector import draw_halves
+from jast._src.weakness.validation import iteration_key
 
 SHARES = (0.05, 0.1, 0.25)  # of the inputs: budgets
 CANDIDATES = 0.0627  # of the inputs, as many as in the thesis

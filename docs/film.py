@@ -15,8 +15,8 @@ import matplotlib.pyplot as plt
 from matplotlib.animation import FuncAnimation, PillowWriter
 
 import jast
-from jast.plot import style
-from jast.simulators.ferry import COLLISION
+from jast._src.plot import style
+from jast._src.simulators.ferry import COLLISION
 
 ORDINARY = 40  # episodes by chance
 HOLD = 14  # frames that the end stays

@@ -18,7 +18,7 @@ import matplotlib.pyplot as plt
 from matplotlib.animation import FuncAnimation, PillowWriter
 
 import jast
-from jast.plot import style
+from jast._src.plot import style
 
 NOTEBOOK = Path(__file__).parents[1] / "notebooks/trained_policy.ipynb"
 EVERY = 2  # steps of 20 ms a frame

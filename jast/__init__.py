@@ -2,13 +2,40 @@
 probability on them.
 """
 
-from jast._doors import dir_function, door
-from jast.contract import check
-from jast.crude import nominal
-from jast.episode import Episode, replay, rollout
-from jast.files import load, save
-from jast.policy import Policy
-from jast.simulator import Simulator
+from typing import TYPE_CHECKING
+
+from jast._src.core.check import check
+from jast._src.core.episode import Episode, replay, rollout
+from jast._src.core.nominal import nominal
+from jast._src.core.policy import Policy
+from jast._src.core.simulator import Simulator
+from jast._src.io.save_load import load, save
+from jast._src.util.doors import dir_function, door
+
+if TYPE_CHECKING:  # what `__getattr__` hands out, for editors and type checkers
+    from jast import (
+        actions,
+        adapters,
+        blackbox,
+        cross_entropy,
+        distributions,
+        estimate,
+        explain,
+        failures,
+        heads,
+        incidents,
+        plot,
+        policies,
+        rewards,
+        search,
+        simulators,
+        specs,
+        typing,
+        weakness,
+    )
+    from jast._src.runtime.compilation_cache import cache
+    from jast._src.stress_testing.stress import stress
+    from jast._src.sweeping.sweep import sweep
 
 __version__ = "0.2.0"
 
@@ -48,7 +75,7 @@ __all__ = [
 # a room is loaded when it is first entered: importing jast costs little more than importing jax
 _ROOMS = [name for name in __all__ if name not in globals()]
 _CALLS = {
-    "cache": "jast.compilation_cache:cache",
+    "cache": "jast._src.runtime.compilation_cache:cache",
     "stress": "jast.stress_testing:stress",
     "sweep": "jast.sweeping:sweep",
 }

@@ -11,23 +11,24 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from jast import actions, failures, nominal, plot, replay, rewards, save, simulators
-from jast.actions import UniformBox
-from jast.compilation_cache import cache
-from jast.contract import check
+from jast import nominal, plot, replay, save, simulators
+from jast._src.core import actions, failures, rewards
+from jast._src.core.actions import UniformBox
+from jast._src.core.check import check
+from jast._src.core.rewards import likelihood
+from jast._src.core.signature import outline
+from jast._src.core.simulator import Simulator
+from jast._src.runtime.compilation_cache import cache
+from jast._src.search.cem import cem
+from jast._src.search.forest import forest
+from jast._src.search.mcts import mcts
+from jast._src.search.monte_carlo import monte_carlo
+from jast._src.search.result import table
+from jast._src.simulators.svg_states import DRAWN
+from jast._src.stress_testing.stress import DEFAULT_BUDGET
+from jast._src.util.intervals import clopper_pearson
 from jast.explain import cards
-from jast.intervals import clopper_pearson
-from jast.outline import outline
-from jast.rewards import likelihood
-from jast.search.cem import cem
-from jast.search.forest import forest
-from jast.search.mcts import mcts
-from jast.search.monte_carlo import monte_carlo
-from jast.search.result import table
-from jast.simulator import Simulator
-from jast.simulators.drawings import DRAWN
 from jast.stress_testing import stress
-from jast.stress_testing.portfolio import DEFAULT_BUDGET
 
 STANDARD = rewards.standard(event_bonus=30.0, density="mode")
 SYSTEMS = {  # name: the simulator, the reward and the actions of a search

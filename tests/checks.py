@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import jast
-from jast import failures as F
+from jast._src.core import failures as F
 
 ROOT = Path(__file__).parents[1]
 

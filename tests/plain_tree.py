@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jast.search.tree import layout as T
+from jast._src.search.tree import layout as T
 
 
 def drawn_as_published(keys, simulations, slots):

@@ -9,11 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 
 import jast
-from jast.crude import Nominal
+from jast._src.core.nominal import Nominal
+from jast._src.estimate.estimate import Estimate
+from jast._src.search.refine.modes import Mode, Modes
+from jast._src.stress_testing.report import Report, Tried
 from jast.distributions import Joint, Normal
-from jast.estimate.estimate import Estimate
-from jast.search.failure_modes import Mode, Modes
-from jast.stress_testing.report import Report, Tried
 
 __all__ = ["EVIL", "SIM", "Car", "estimate", "made"]
 

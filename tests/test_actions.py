@@ -206,7 +206,7 @@ def test_searches_draw_from_the_proposal_and_score_by_the_model(key, search):
         mcts=dict(simulations=100),
     )[search]
     found = getattr(jast.search, search)(
-        key, sim, actions=near, reward=jast.rewards.STANDARD, **sizes
+        key, sim, actions=near, reward=jast._src.core.rewards.STANDARD, **sizes
     )
     assert found.failing_share == 1
     e = found.failures.episodes

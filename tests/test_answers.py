@@ -10,9 +10,11 @@ from jax.tree_util import Partial
 
 import jast
 from jast import distributions as D
+from jast._src.estimate import weighted_draws
+from jast._src.estimate.importance_sampling import Traces
+from jast._src.estimate.weighted_draws import moments_of_weights, scaled_weights, share_interval
 from jast.estimate import (
     distance_quantile,
-    draws,
     events,
     exceedance,
     failure_probability,
@@ -23,8 +25,6 @@ from jast.estimate import (
     subset_simulation,
     trace_proposal,
 )
-from jast.estimate.draws import moments_of_weights, scaled_weights, share_interval
-from jast.estimate.importance_sampling import Traces
 from jast.simulators import walk1d
 
 norm = scipy.stats.norm
@@ -211,15 +211,15 @@ def test_a_black_box_is_not_called_again(key):
 
 def test_memory_is_bounded(monkeypatch):
     """Failures are thinned and count for more, of the others the nearest stay."""
-    monkeypatch.setattr(draws, "MAX_KEPT", 100)
+    monkeypatch.setattr(weighted_draws, "MAX_KEPT", 100)
     rng = np.random.default_rng(0)
-    kept, n, log_w = draws.empty_draws(), 4000, []
+    kept, n, log_w = weighted_draws.empty_draws(), 4000, []
     for _ in range(8):
         distance = rng.random(n).astype(np.float32)
         failure = distance < 0.25
         log_w.append(np.where(failure, rng.normal(size=n) - 20, 0.0).astype(np.float32))
         none = np.zeros(n, bool)
-        kept = draws.add_draws(
+        kept = weighted_draws.add_draws(
             kept, Traces(log_w[-1], None, failure, none, none.astype(np.int32), distance)
         )
     assert kept.failure.sum() <= 100 and (~kept.failure).sum() <= 200

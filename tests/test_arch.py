@@ -11,14 +11,9 @@ import numpy as np
 import pytest
 
 import jast
+from jast._src.simulators.arch import transmission
 from jast.distributions import Beta, Independent
-from jast.simulators.arch import (
-    SPECIFICATIONS,
-    automatic_transmission,
-    chasing_cars,
-    simulate,
-    transmission,
-)
+from jast.simulators.arch import SPECIFICATIONS, automatic_transmission, chasing_cars, simulate
 from jast.specs import always, parts, predicate, robustness, trace_of
 
 CORNERS = np.random.default_rng(2).integers(0, 2, (20, 2)).astype(float)

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from test_failure_probability import FAR, planes
 
-from jast.estimate import audit
-from jast.estimate.audit import Missing, audit_proposal, uncovered
-from jast.estimate.gaussian_family import GaussianFamily, Points
-from jast.estimate.gaussians import as_latent, unit_gaussians
-from jast.estimate.search_settings import SETTINGS
-from jast.estimate.search_state import SearchState, add_batch, search_context
+from jast._src.estimate.gaussians.family import GaussianFamily, Points
+from jast._src.estimate.gaussians.mixture_fit import as_latent, unit_gaussians
+from jast._src.estimate.proposal_search import audit
+from jast._src.estimate.proposal_search.audit import Missing, audit_proposal, uncovered
+from jast._src.estimate.proposal_search.search_state import SearchState, add_batch, search_context
+from jast._src.estimate.proposal_search.settings import SETTINGS
 
 BUDGET = 500_000  # a batch is 20,000 episodes
 

@@ -16,10 +16,11 @@ from systems import TOLD
 
 import jast
 from jast import blackbox
-from jast.blackbox import worker
+from jast._src.blackbox import host_calls, worker
+from jast._src.estimate.tilts.replay import numbers_of_episodes
+from jast._src.runtime.host_errors import GROUPS, Log, new_incidents
 from jast.distributions import Categorical, Independent, Joint, MultivariateNormalDiag, Normal
-from jast.estimate.recorded_tilts import numbers_of_episodes
-from jast.incidents import GROUPS, Log, incidents, new_incidents
+from jast.incidents import incidents
 
 NORMAL = Normal(0.0, 1.0)
 
@@ -57,7 +58,9 @@ class Looks(blackboxes.Walk):
 def test_episodes_are_those_of_the_system_in_jax_and_counted_once(key):
     sim = box(blackboxes.walk, 4)
     ours, theirs = (
-        jast.search.monte_carlo(key, s, episodes=1500, top=3, reward=jast.rewards.STANDARD)
+        jast.search.monte_carlo(
+            key, s, episodes=1500, top=3, reward=jast._src.core.rewards.STANDARD
+        )
         for s in (sim, in_jax(episodic=True))
     )
     assert ours.failing_share == theirs.failing_share > 0
@@ -118,7 +121,7 @@ def test_check_says_where_failures_on_the_way_are_lost():
         assert jast.check(sim) is sim
     lost = int(str(said[0].message).split()[2])
     before = blackbox.calls(sim)
-    host = next(jast.incidents.sources(sim, "compare")).host
+    host = next(jast._src.runtime.host_errors.sources(sim, "compare")).host
     # the first comes back, the last at the end; the others stay near, or are away at their end
     rows = np.zeros((6, 8))
     rows[5, -2:] = 5, -5
@@ -585,7 +588,7 @@ def test_a_distance_beyond_the_precision_is_no_number():
 
 
 def test_the_memory_of_outcomes_is_bounded(monkeypatch):
-    monkeypatch.setattr(blackbox.host, "REMEMBERED", 2)
+    monkeypatch.setattr(host_calls, "REMEMBERED", 2)
     outcome = [0.0]
     sim = box(lambda x: (bool(x[0] > 5), outcome[0]))
     ends(sim, [[1, 0], [2, 0], [3, 0], [9, 0]])  # the first is forgotten; failures have their own

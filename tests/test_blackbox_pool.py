@@ -16,9 +16,11 @@ import pytest
 
 import jast
 from jast import blackbox
-from jast.blackbox.pool import Pool
+from jast._src.blackbox import pool
+from jast._src.blackbox.pool import Pool
+from jast._src.runtime.host_errors import sources
 from jast.distributions import Normal
-from jast.incidents import incidents, sources
+from jast.incidents import incidents
 
 pytest.importorskip("loky")
 LIMIT = 0.3
@@ -197,7 +199,7 @@ def test_bad_input_is_named(monkeypatch):
         box(lambda: type("Mute", (blackboxes.Walk,), {"is_event": None})())
     monkeypatch.setitem(sys.modules, "loky", None)
     with pytest.raises(ImportError, match=r"pip install 'jast\[blackbox\]'"):
-        Pool(b"", 1, None)._start([blackbox.pool.Worker(b"")])
+        Pool(b"", 1, None)._start([pool.Worker(b"")])
 
 
 def test_a_system_that_no_worker_can_load_ends_the_search(tmp_path, monkeypatch):

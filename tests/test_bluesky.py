@@ -10,8 +10,8 @@ import pytest
 
 import jast
 from jast import blackbox
+from jast._src.simulators.bluesky import Route, bluesky, bluesky_flight, judged, nearest
 from jast.incidents import incidents
-from jast.simulators.bluesky import Route, bluesky, bluesky_flight, judged, nearest
 
 
 @pytest.fixture(scope="module")

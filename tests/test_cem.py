@@ -10,11 +10,12 @@ from checks import archive_replays, reward_of
 from systems import S0, TOLD, hyperplane, ring, two_densities, walk
 
 import jast
-from jast import actions, rewards
+from jast import actions
+from jast._src.core import rewards
+from jast._src.search.cem import cem
+from jast._src.search.monte_carlo import monte_carlo
 from jast.distributions import seeds
 from jast.failures import collect
-from jast.search.cem import cem
-from jast.search.monte_carlo import monte_carlo
 
 SMALL = dict(samples=100, elites=10, iterations=10) | TOLD | dict(actions=actions.quantiles())
 WEIGHED = rewards.shaped(20.0, event_bonus=30.0, density="mode")

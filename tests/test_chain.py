@@ -14,13 +14,14 @@ from systems import walk
 
 import jast
 from benchmarks import stress_systems
-from jast import limit_state, rewards
+from jast import rewards
+from jast._src.normal_space import transform
+from jast._src.search import chain_moves
+from jast._src.search.best_episodes import BestEpisodes, standard_reward
+from jast._src.search.chain import chain
 from jast.distributions import Normal, seeds
-from jast.search import tempering
-from jast.search.chain import chain
-from jast.search.kept import BestEpisodes, standard_reward
 
-module = importlib.import_module("jast.search.chain")
+module = importlib.import_module("jast._src.search.chain")
 SMALL = dict(episodes=3000, refine=0)
 BRANCHES = stress_systems.branches(3.0)
 
@@ -33,16 +34,16 @@ def test_every_width_has_its_distribution(key):
     sim = walk()
     search = module._Search(key, sim, 10_000, 0.9, 64)
     search.levels, search.chains = 4, 16
-    best, d = BestEpisodes.none(sim, 64), limit_state.dimension(sim)
-    nothing = tempering.no_points(64, d, np.float32)
-    draws = nothing, nothing, nothing, tempering.Points(*_drawn(key, sim, 3.0, 64))
+    best, d = BestEpisodes.none(sim, 64), transform.dimension(sim)
+    nothing = chain_moves.no_points(64, d, np.float32)
+    draws = nothing, nothing, nothing, chain_moves.Points(*_drawn(key, sim, 3.0, 64))
     chains, widths = search.first_chains(draws)
     assert widths[0] == 3 and np.isclose(widths[-1], 0.9)
     seen = []
     for i in range(600):
         ends = jnp.int32(64 * 4 * i), jnp.int32(64 * 4 * (i + 1))
         args = search.key, sim, search.reward, best, chains, widths, *ends
-        (best, chains), _ = tempering.move_chains(*args)
+        (best, chains), _ = chain_moves.move_chains(*args)
         if i >= 100:
             points = jax.device_get(chains.points)
             seen.append(_numbers(points.z, points.used, d))
@@ -58,9 +59,9 @@ def test_every_width_has_its_distribution(key):
 
 
 def _drawn(key, sim, width, n):
-    shape = n, limit_state.dimension(sim)
-    z = width * jax.random.normal(key, shape, limit_state.normal_numbers(sim))
-    o = limit_state.outcomes(sim, z)
+    shape = n, transform.dimension(sim)
+    z = width * jax.random.normal(key, shape, transform.normal_numbers(sim))
+    o = transform.outcomes(sim, z)
     return z, o.used, o.failure, o.distance
 
 

@@ -12,10 +12,11 @@ from jax.tree_util import Partial
 from systems import line
 
 import jast
-from jast import actions, crude
+from jast import actions
 from jast import distributions as D
-from jast.contract import contract
-from jast.intervals import clopper_pearson
+from jast._src.core import nominal
+from jast._src.core.check import contract
+from jast._src.util.intervals import clopper_pearson
 from jast.simulators import ferry, landing, limit_state, walk1d
 
 
@@ -416,11 +417,11 @@ def test_nominal_interrupted_is_the_nominal_of_what_was_done(key, equal, monkeyp
     whole = jast.nominal(key, walk1d(), episodes=2100)
     seed = jax.random.key_data(key).tolist()
     assert whole.settings == dict(method="nominal", episodes=2100, seed=seed)
-    monkeypatch.setattr(crude, "UNITS", 1)  # of two chunks or three, else of one
+    monkeypatch.setattr(nominal, "UNITS", 1)  # of two chunks or three, else of one
     equal(jast.nominal(key, walk1d(), episodes=2100)[:-1], whole[:-1])
     of_two = jast.nominal(key, walk1d(), episodes=2048)
     monkeypatch.undo()
-    real = crude._unit
+    real = nominal._unit
 
     def interrupted(stop_at):
         def unit(job, number, post):
@@ -428,7 +429,7 @@ def test_nominal_interrupted_is_the_nominal_of_what_was_done(key, equal, monkeyp
                 raise KeyboardInterrupt
             return real(job, number, post)
 
-        monkeypatch.setattr(crude, "_unit", unit)
+        monkeypatch.setattr(nominal, "_unit", unit)
         return jast.nominal(key, walk1d(), episodes=2100)
 
     part = interrupted(2)

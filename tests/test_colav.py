@@ -23,14 +23,14 @@ from systems import mark_long
 
 import jast
 from jast import distributions as D
-from jast.episode import _rollout, play_back
-from jast.plot.colav import zone_outline
-from jast.rewards import STANDARD, as_pytree
-from jast.simulators import colav
-from jast.simulators.colav import SCENARIOS, Scenario, planner, tracker, vessels
-from jast.simulators.colav.planner import DESIRED, SPEEDS, ZONES, inside
-from jast.simulators.colav.tracker import Track
-from jast.simulators.colav.vessels import (
+from jast._src.core.episode import _rollout, play_back
+from jast._src.core.rewards import STANDARD
+from jast._src.plot.colav import zone_outline
+from jast._src.simulators import colav
+from jast._src.simulators.colav import SCENARIOS, Scenario, planner, tracker, vessels
+from jast._src.simulators.colav.planner import DESIRED, SPEEDS, ZONES, inside
+from jast._src.simulators.colav.tracker import Track
+from jast._src.simulators.colav.vessels import (
     Adversary,
     Control,
     Pose,
@@ -38,6 +38,7 @@ from jast.simulators.colav.vessels import (
     adversary_substep,
     ferry_substep,
 )
+from jast.rewards import as_pytree
 
 KINDS = ("delay", "steering", "noise")
 STEPS, SUBSTEPS, STEP = 25, 30, 3.0

@@ -10,7 +10,7 @@ import jax
 import pytest
 
 import jast
-from jast import compilation_cache
+from jast._src.runtime import compilation_cache
 
 OPTIONS = (
     "jax_compilation_cache_dir",

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import scipy.stats
 
-from jast.counter import COUNTER, tree_keys
+from jast._src.core.counter_prng import COUNTER, tree_keys
 
 N = 1 << 16
 SEEDS = [0, 1, 12345]

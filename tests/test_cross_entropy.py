@@ -9,10 +9,10 @@ import pytest
 from jax.tree_util import Partial
 
 from jast import cross_entropy as ce
-from jast.cross_entropy import loop, surrogates
-from jast.cross_entropy.gaussian import Gaussian
-from jast.cross_entropy.mixture import Mixture
-from jast.cross_entropy.settle import MODES, make_plan
+from jast._src.cross_entropy import iterate, surrogates
+from jast._src.cross_entropy.gaussian import Gaussian
+from jast._src.cross_entropy.mixture import Mixture
+from jast._src.cross_entropy.plan import MODES, make_plan
 
 METHODS = {"ce_method": ce.ce_method, "ce_surrogate": ce.ce_surrogate, "ce_mixture": ce.ce_mixture}
 CASES = {"1A": (0.0, 200.0, 10, 5), "1B": (-50.0, 2000.0, 10, 5), "1C": (0.0, 200.0, 5, 3)}
@@ -84,7 +84,7 @@ def test_the_surrogate_sees_what_it_may_remember(key, x64):
         value[[3, 9]] = np.nan
         ends = np.cumsum((0, *counts))
         for k in range(5):
-            state = loop.begin(
+            state = iterate.begin(
                 plan,
                 key,
                 make_plan(
@@ -101,7 +101,7 @@ def test_the_surrogate_sees_what_it_may_remember(key, x64):
             log[0][: ends[k + 1]], log[1][: ends[k + 1]] = x[: ends[k + 1]], value[: ends[k + 1]]
             state = state._replace(x=jnp.asarray(log[0]), value=jnp.asarray(log[1]))
             since = ends[max(0, k + 1 - memory)]
-            seen = loop._surrogate_data(plan, state, jnp.int32(since), jnp.int32(ends[k + 1]))
+            seen = iterate._surrogate_data(plan, state, jnp.int32(since), jnp.int32(ends[k + 1]))
             # NaN sorts last
             older = [i for i in np.argsort(value[:since]) if np.isfinite(value[i])][:best]
             rows = [*range(since, ends[k + 1]), *older]
@@ -133,7 +133,7 @@ def test_true_model_and_sub_elites_make_the_next_proposal(k, key, x64):
     for_samples, for_searches = jax.random.split(
         jax.random.fold_in(jax.random.fold_in(before.state.key, k), 1)
     )
-    judged = np.asarray(loop.draw(for_samples, proposal, 200))
+    judged = np.asarray(iterate.draw(for_samples, proposal, 200))
     np.testing.assert_array_equal(after.state.model_x[k], judged)
     (last, last_value), (x, value) = (
         batches[k],
@@ -291,7 +291,7 @@ def test_proposals_and_objectives_share_one_program(key, traced):
         iterations=2,
         alpha=2.0,
     )
-    assert loop.run.__name__ not in traced
+    assert iterate.run.__name__ not in traced
     runs = jax.vmap(
         lambda m: ce.ce_method(key, f, (m, jnp.eye(2)), samples=4, elites=3, iterations=2)
     )(jnp.arange(6.0).reshape(3, 2))
@@ -790,10 +790,10 @@ def test_moments_of_a_mixture():
         jnp.array([[-1.0, 0.0], [1.0, 2.0]]),
         jnp.stack([jnp.eye(2), 2 * jnp.eye(2)]),
     )
-    g = loop.moments(m)
+    g = iterate.moments(m)
     np.testing.assert_allclose(g.mean, [0.5, 1.5])
     np.testing.assert_allclose(g.covariance, 1.75 * np.eye(2) + [[0.75, 0.75], [0.75, 0.75]])
-    assert loop.moments(g) is g
+    assert iterate.moments(g) is g
 
 
 def test_a_short_search_returns_the_best_that_it_drew(key):
@@ -805,7 +805,7 @@ def test_a_short_search_returns_the_best_that_it_drew(key):
         return value
 
     centres = jnp.array([[0.0, 0.0], [9.0, 9.0]])
-    sub = loop.search_around(key, model, centres, jnp.eye(2), samples=40, elites=8, iterations=6)
+    sub = iterate.search_around(key, model, centres, jnp.eye(2), samples=40, elites=8, iterations=6)
     jax.effects_barrier()
     drawn = np.concatenate([d.reshape(-1, 2) for d in drawn])
     assert len(drawn) == 2 * 6 * 40
@@ -818,7 +818,7 @@ def test_a_short_search_returns_the_best_that_it_drew(key):
 
 
 def test_the_frame_of_one_scale():
-    frame = loop._spherical_frame(
+    frame = iterate._spherical_frame(
         Gaussian(jnp.array([1.0, 2.0, 3.0]), jnp.diag(jnp.array([1.0, 4.0, 7.0])))
     )
     np.testing.assert_allclose(frame[1], 2 * np.eye(3))

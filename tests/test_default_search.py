@@ -12,10 +12,11 @@ from checks import archive_replays, reward_of
 from systems import TOLD, mark_long, ring, walk
 
 import jast
-from jast import actions, rewards
+from jast import actions
 from jast import distributions as D
+from jast._src.core import rewards
+from jast._src.search.calibration import calibrate
 from jast.search import cem, forest, mcts, monte_carlo
-from jast.search.pilot import calibrate
 
 SEARCHES = {
     "cem": lambda key, sim, **of: cem(key, sim, samples=100, elites=10, iterations=8, **of),

@@ -13,18 +13,13 @@ from scipy import stats
 
 import jast
 from jast import distributions as D
-from jast.counter import counter_key
-from jast.estimate import (
-    adaptive,
-    budgets,
-    descents,
-    failure_probability,
-    population,
-    population_search,
-)
-from jast.estimate.descents import DESCENTS, by_distance, by_width
-from jast.estimate.estimate import MAX_RELATIVE_ERROR
-from jast.estimate.particles import (
+from jast._src.core.counter_prng import counter_key
+from jast._src.estimate import budgets
+from jast._src.estimate import failure_probability as adaptive
+from jast._src.estimate.estimate import MAX_RELATIVE_ERROR
+from jast._src.estimate.population import descents, search
+from jast._src.estimate.population.descents import DESCENTS, by_distance, by_width
+from jast._src.estimate.population.particle_moves import (
     AFTER,
     SMALL,
     WINDOW,
@@ -35,11 +30,12 @@ from jast.estimate.particles import (
     move_particles,
     record_crossings,
 )
-from jast.estimate.population_search import Answer, answer_of
-from jast.intervals import clopper_pearson
-from jast.limit_state import outcomes
+from jast._src.estimate.population.search import Answer, answer_of
+from jast._src.normal_space.transform import outcomes
+from jast._src.stress_testing import stress
+from jast._src.util.intervals import clopper_pearson
+from jast.estimate import failure_probability, population
 from jast.simulators import limit_state, walk1d
-from jast.stress_testing import portfolio
 
 norm = stats.norm
 N = 1024
@@ -317,9 +313,7 @@ def test_chains_tell_closed_forms(key, way, sim, truth):
     """1.4e-4, 7.3e-4, 1.5e-4 and 4.5e-4, from four populations."""
     runs = [DESCENTS[way](k, sim, N, 10, N) for k in jax.random.split(key, 4)]
     a = answer_of(runs)
-    assert (
-        abs(a.log_mean - np.log(truth)) < 4 * a.relative < 4 * population_search.MAX_WITNESS_ERROR
-    )
+    assert abs(a.log_mean - np.log(truth)) < 4 * a.relative < 4 * search.MAX_WITNESS_ERROR
     assert bool(outcomes(sim, jnp.asarray(runs[0].points)).failure.all())
 
 
@@ -495,7 +489,7 @@ def test_known_failures_and_neighbours_lead_a_proposal(key, monkeypatch):
 
 
 def episodes_of(sim, z):
-    return jax.device_get(jast.limit_state.episodes(sim, jnp.asarray(z)))
+    return jax.device_get(jast._src.normal_space.transform.episodes(sim, jnp.asarray(z)))
 
 
 def test_a_black_box_keeps_the_thrifty_way(key, monkeypatch):
@@ -520,8 +514,8 @@ def test_a_black_box_keeps_the_thrifty_way(key, monkeypatch):
 def small(monkeypatch):
     """Populations in `jast.stress` from 50,000 evaluations on, with little to polish."""
     monkeypatch.setattr(budgets, "MIN_POPULATION_BUDGET", 50_000)
-    monkeypatch.setattr(portfolio, "MIN_POPULATION_BUDGET", 50_000)
-    monkeypatch.setattr(portfolio, "REFINE_EVALUATIONS", 6000)
+    monkeypatch.setattr(stress, "MIN_POPULATION_BUDGET", 50_000)
+    monkeypatch.setattr(stress, "REFINE_EVALUATIONS", 6000)
 
 
 def test_stress_where_failures_are_frequent(key, small):
@@ -546,11 +540,7 @@ def test_stress_of_a_rare_failure(key, small):
         "populations",
         "cooled",
     ]
-    assert (
-        abs(p.log_mean - norm.logsf(4))
-        < 4 * p.relative_error
-        < 4 * population_search.MAX_WITNESS_ERROR
-    )
+    assert abs(p.log_mean - norm.logsf(4)) < 4 * p.relative_error < 4 * search.MAX_WITNESS_ERROR
     assert p.plain[-1] > report.nominal.episodes and p.guaranteed[0] < norm.sf(4) < p.guaranteed[1]
     assert float(report.failures.best.reward) == pytest.approx(-8, abs=0.05)
     assert [m.share for m in report.modes] == [1.0]

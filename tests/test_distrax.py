@@ -14,7 +14,7 @@ from systems import mark_long
 import jast
 from jast import distributions as D
 from jast import simulators
-from jast.distributions.other import distrax
+from jast._src.distributions.distrax_loader import distrax
 
 OWN = ["Bernoulli", "Beta", "Categorical", "Gamma", "Independent", "Joint", "Laplace", "Logistic"]
 OWN += ["MultivariateNormalDiag", "MultivariateNormalTri", "Normal", "Uniform"]

@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from jast import distributions as D
-from jast.distributions import numerics
+from jast._src.distributions import normal_tails
 
 unit = st.floats(0.0, 1.0, width=32)
 
@@ -599,8 +599,8 @@ def test_slopes_of_the_normal_distribution_function_and_of_its_inverse(dtype):
     p = scipy.stats.norm.cdf(z).astype(dtype)
     density = scipy.stats.norm.pdf(z.astype(float))
     rtol = 1e-5 if dtype == "float32" else 1e-12
-    slope = jax.vmap(jax.grad(numerics.ndtr))(z)
+    slope = jax.vmap(jax.grad(normal_tails.ndtr))(z)
     np.testing.assert_allclose(slope, density, rtol=rtol)
-    inverse = jax.vmap(jax.grad(numerics.ndtri))(p[z < 0])
+    inverse = jax.vmap(jax.grad(normal_tails.ndtri))(p[z < 0])
     of_p = 1 / scipy.stats.norm.pdf(scipy.stats.norm.ppf(p[z < 0].astype(float)))
     np.testing.assert_allclose(inverse, of_p, rtol=30 * rtol)  # z itself is rounded, to z^2 eps

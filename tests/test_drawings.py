@@ -10,7 +10,7 @@ from browser import browsed
 
 import jast
 from jast import simulators
-from jast.simulators.svg import BLUE, VERMILION, Plane
+from jast._src.simulators.svg import BLUE, VERMILION, Plane
 
 
 def states(sim, key=0):

@@ -12,8 +12,8 @@ from test_indices import plane
 
 import jast
 from jast import explain
+from jast._src.explain.eigenfailures import components
 from jast.distributions import Bernoulli, Joint, Normal
-from jast.explain.eigenfailures import components
 
 PHI = NormalDist()
 

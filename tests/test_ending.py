@@ -13,9 +13,11 @@ from systems import TOLD, dice
 
 import jast
 from benchmarks.stress_systems import linear
-from jast import actions, rewards
+from jast import actions
+from jast._src.core import rewards
+from jast._src.search.refine import final
 from jast.distributions import Normal, Weibull
-from jast.search import cem, chain, ending, forest, go_explore, mcts, monte_carlo
+from jast.search import cem, chain, forest, go_explore, mcts, monte_carlo
 
 SIM = linear(10, beta=3.0)
 SEARCHES = {
@@ -64,7 +66,7 @@ def test_it_pays_and_leaves_the_search_as_it_was(key, name, equal, tmp_path):
     assert f"evaluations, log p relative to the mode {before:.2f} -> {after:.2f}" in str(on)
 
     # the refined ones say so, and the others are as they were
-    mine = on.failures.tree == ending.REFINED
+    mine = on.failures.tree == final.REFINED
     assert mine.any() and on.failures.seen == off.failures.seen
     for e, row in zip(on.failures.episodes.disturbances[mine], on.failures.simulation[mine]):
         equal(e, on.refined.failures[int(row)].disturbances)
@@ -89,7 +91,7 @@ def test_a_reward_of_ones_own_and_what_is_published_have_none(key):
     asked = cem(key, SIM, **few, **own, **wide, refine=0.2, top=2)
     assert len(asked.failures) == 2 and asked.best.reward == asked.failures.best.reward
     assert asked.best.reward > found.best.reward and asked.best.states is not None
-    assert asked.failures.tree[0] == ending.REFINED
+    assert asked.failures.tree[0] == final.REFINED
 
 
 def test_where_it_is_off(key):
@@ -101,9 +103,9 @@ def test_where_it_is_off(key):
     assert few.refined is None
     assert few.episodes * 0.05 < 100
     relative, raw = (rewards.lexicographic(1.0, 5.0, density=d) for d in ("mode", "raw"))
-    assert ending.default_share(SIM, relative) == 0.1
-    assert ending.default_share(SIM, raw) == 0 == ending.default_share(SIM, rewards.STANDARD)
-    share_of = ending.with_refine_share
+    assert final.default_share(SIM, relative) == 0.1
+    assert final.default_share(SIM, raw) == 0 == final.default_share(SIM, rewards.STANDARD)
+    share_of = final.with_refine_share
     assert share_of("", None, SIM, {}, 0.1)["refine"] == 0.1
     assert share_of("", None, dice(), {}, 0.1)["refine"] == 0
     assert share_of("", None, SIM, None, 0.1) is None
@@ -170,7 +172,7 @@ def test_an_interruption_leaves_what_was_found(key, monkeypatch):
         raise KeyboardInterrupt
 
     search = SEARCHES["cem"]
-    monkeypatch.setattr(ending, "refine", interrupted)
+    monkeypatch.setattr(final, "refine", interrupted)
     found = search(key, SIM)
     assert found.refined is None and found.failures.size == 64
     assert found.settings["interrupted"] == f"while refining, after all {found.episodes} episodes"

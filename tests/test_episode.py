@@ -13,7 +13,8 @@ from systems import line as walk_by_steps
 
 import jast
 from jast import distributions as D
-from jast import policy, rewards
+from jast import rewards
+from jast._src.core import policy
 from jast.simulators import ferry, landing, walk1d
 
 # seeds -> reward, failure, steps, miss distance, log-likelihood by the mode; float64, of an

@@ -9,11 +9,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import jast
+from jast._src.estimate.diagnostics import weight_warnings
+from jast._src.estimate.estimate import estimate_from_counts, estimate_from_weights
+from jast._src.estimate.importance_sampling import Traces
+from jast._src.estimate.weight_sums import add_traces, empty_sums
 from jast.estimate import pareto_k
-from jast.estimate.diagnostics import weight_warnings
-from jast.estimate.estimate import estimate_from_counts, estimate_from_weights
-from jast.estimate.importance_sampling import Traces
-from jast.estimate.sums import add_traces, empty_sums
 
 
 def traces(log_w, failure=None, log_shares=None, invalid=None, length=None):

@@ -13,8 +13,8 @@ import jast
 from benchmarks.stress_systems import slips
 from jast import distributions as D
 from jast import explain
+from jast._src.search.refine.modes import Mode
 from jast.distributions import Joint, Normal, Uniform
-from jast.search.failure_modes import Mode
 
 
 def sums(weights, limit, **changes):

@@ -14,8 +14,8 @@ import jast
 from benchmarks.explain_systems import planted
 from benchmarks.stress_systems import slips
 from jast import explain
+from jast._src.explain.held_out import hold_out
 from jast.distributions import Joint, Normal, Uniform
-from jast.explain.learning import hold_out
 from jast.search import Mode, Modes
 
 pytest.importorskip("sklearn", reason="rules and monitors learn with scikit-learn")

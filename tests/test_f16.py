@@ -7,8 +7,9 @@ import pytest
 
 import jast
 from benchmarks import arch_flights
+from jast._src.simulators.arch import f16, f16_design, gcas
 from jast.distributions import Independent, Normal
-from jast.simulators.arch import SPECIFICATIONS, f16, f16_design, fly, gcas
+from jast.simulators.arch import SPECIFICATIONS, fly
 from jast.simulators.arch import ground_collision_avoidance as avoidance
 from jast.specs import robustness
 

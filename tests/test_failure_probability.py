@@ -19,23 +19,12 @@ import jast
 from benchmarks import limit_states
 from benchmarks.limit_states import walk_probability
 from jast import distributions as D
-from jast import limit_state as L
-from jast.estimate import (
-    adapt,
-    adaptive_cross_entropy,
-    by_proposal,
-    failure_probability,
-    failure_samples,
-    gaussian_start,
-    subset_simulation,
-    trace_proposal,
-)
-from jast.estimate.adaptive import MIN_BUDGET
-from jast.estimate.batches import log_ratio, random_numbers
-from jast.estimate.design_points import design_points, distinct
-from jast.estimate.estimate import MAX_RELATIVE_ERROR, flag_imprecise
-from jast.estimate.gaussian_family import GaussianFamily, defensive_parts
-from jast.estimate.gaussians import (
+from jast._src.estimate.estimate import MAX_RELATIVE_ERROR, flag_imprecise
+from jast._src.estimate.failure_probability import MIN_BUDGET
+from jast._src.estimate.gaussians import exploration
+from jast._src.estimate.gaussians.design_points import design_points, distinct
+from jast._src.estimate.gaussians.family import GaussianFamily, defensive_parts
+from jast._src.estimate.gaussians.mixture_fit import (
     Gaussians,
     as_latent,
     fit_mixture,
@@ -43,8 +32,18 @@ from jast.estimate.gaussians import (
     shrink_eigenvalues,
     unit_gaussians,
 )
-from jast.estimate.populations import cool, equilibrate, explore
-from jast.estimate.search_state import search_context
+from jast._src.estimate.host_populations import cool, equilibrate, explore
+from jast._src.estimate.proposal_search import adapt, by_proposal
+from jast._src.estimate.proposal_search.mixture_draws import log_ratio, random_numbers
+from jast._src.estimate.proposal_search.search_state import search_context
+from jast._src.normal_space import transform as L
+from jast.estimate import (
+    adaptive_cross_entropy,
+    failure_probability,
+    failure_samples,
+    subset_simulation,
+    trace_proposal,
+)
 from jast.simulators import landing, limit_state
 
 norm = scipy.stats.norm
@@ -790,6 +789,6 @@ def test_mirror_images_of_failures(key):
     for down, lifts in ((4.4, [1.1]), (8.0, [])):
         f = GaussianFamily(planes(4.0, down), BUDGET, search_context(key))
         anchors = np.full((1, 4), 2.001)
-        points, evaluations = gaussian_start._mirror(f, anchors)
-        assert evaluations == len(gaussian_start.LIFTS) and len(points) == len(lifts)
+        points, evaluations = exploration._mirror(f, anchors)
+        assert evaluations == len(exploration.LIFTS) and len(points) == len(lifts)
         assert np.allclose(points, [-lift * anchors[0] for lift in lifts] or points)

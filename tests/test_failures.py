@@ -15,8 +15,8 @@ from hypothesis import strategies as st
 from systems import PUBLISHED
 
 import jast
-from jast import failures as F
-from jast import files
+from jast._src.core import failures as F
+from jast._src.io import save_load
 from jast.distributions import Independent, Joint, MultivariateNormalDiag, Normal
 
 FERRY = jast.simulators.ferry()
@@ -371,8 +371,8 @@ def test_load_refuses_other_files_and_versions(tmp_path, archive, monkeypatch):
         F.load(tmp_path / "b")
     for version in (0, 2):
         with monkeypatch.context() as patch:
-            kind = files.KINDS["jast failures"]._replace(version=version)
-            patch.setitem(files.KINDS, "jast failures", kind)
+            kind = save_load.KINDS["jast failures"]._replace(version=version)
+            patch.setitem(save_load.KINDS, "jast failures", kind)
             F.save(path, archive)
         with pytest.raises(
             ValueError, match=f"has version {version}, and this jast reads version 1"

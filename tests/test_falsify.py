@@ -77,7 +77,7 @@ def test_one_at_a_time_on_a_black_box(key):
 
 
 def test_what_came_after_an_episodes_end_is_left_as_it_is():
-    module = importlib.import_module("jast.search.falsify")
+    module = importlib.import_module("jast._src.search.falsify")
     rows = np.random.default_rng(0).uniform(size=(1, 8, 2))
     pool = module.Pool(np.ones(1), rows, np.zeros((1, 0)), np.array([3]))
     rng = np.random.default_rng(1)
@@ -111,7 +111,7 @@ def test_bad_input_and_interrupts(key, monkeypatch):
 
     found = falsify(key, held(), simulations=100, stop=False, callback=stop)
     assert found.episodes == 20 and found.settings["interrupted"] == "after 20 of 100 episodes"
-    module = importlib.import_module("jast.search.falsify")
+    module = importlib.import_module("jast._src.search.falsify")
     monkeypatch.setattr(module, "signal", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
     with pytest.raises(KeyboardInterrupt):  # nothing is there yet
         falsify(key, held())

@@ -10,7 +10,7 @@ import scipy.stats as st
 from systems import mark_long
 
 from jast import distributions as D
-from jast.distributions.numerics import log_tails, normal_of_log_tails
+from jast._src.distributions.normal_tails import log_tails, normal_of_log_tails
 
 Z = np.concatenate([-np.geomspace(7.1, 0.01, 60), np.geomspace(0.01, 7.1, 60)])
 

@@ -11,15 +11,10 @@ from jax.tree_util import Partial
 
 import jast
 from benchmarks.few_calls import metaballs
+from jast._src.estimate.few_calls import active_learning, few_calls, surrogate, surrogate_pool
+from jast._src.util.intervals import clopper_pearson
 from jast.distributions import MultivariateNormalDiag
-from jast.estimate import (
-    active_learning,
-    failure_probability,
-    few_calls,
-    surrogate,
-    surrogate_failures,
-)
-from jast.intervals import clopper_pearson
+from jast.estimate import failure_probability
 from jast.simulators import limit_state
 from tests.blackboxes import branches
 
@@ -33,7 +28,7 @@ def coarse(monkeypatch):
     for room in (few_calls, active_learning):
         monkeypatch.setattr(room, "CANDIDATES", 1000)
     for name, value in (("POPULATION", 200), ("SAMPLE", 1000), ("FITTED", 300)):
-        monkeypatch.setattr(surrogate_failures, name, value)
+        monkeypatch.setattr(surrogate_pool, name, value)
 
 
 def _plane(beta, x):
@@ -54,7 +49,7 @@ def test_the_surrogate_knows_a_linear_limit_state_from_its_safe_side():
     mean, sd = surrogate.predict(s, new)
     truth = (1.0 - new[:, 0]) / g[g > 0].std()
     assert np.abs(mean - truth).max() < 0.1 and sd.max() < 0.2
-    assert (surrogate_failures.expected(s, new)[0] > 0.5).tolist() == (truth < 0).tolist()
+    assert (surrogate_pool.expected(s, new)[0] > 0.5).tolist() == (truth < 0).tolist()
 
 
 def test_the_gradient_of_the_likelihood_is_that_of_its_differences():
@@ -80,7 +75,7 @@ def test_points_of_the_pool_weigh_as_the_model_does(coarse):
     z, y, failing = _data()
     s = surrogate.fit(z, y, failing)
     rng = np.random.default_rng(2)
-    found, _ = surrogate_failures.pool(rng, s, z[failing], None, 20_000)
+    found, _ = surrogate_pool.pool(rng, s, z[failing], None, 20_000)
     w = found.weights * (found.z[:, 0] > 1.5)
     error = w.std() / np.sqrt(len(w))
     assert abs(w.mean() - norm.sf(1.5)) < 4 * error < 0.2 * norm.sf(1.5)

@@ -8,8 +8,8 @@ from scipy import stats
 
 import jast
 from jast import distributions as D
-from jast.distributions.containers import accepted
-from jast.distributions.foreign import OF_NUMPYRO, OF_SCIPY
+from jast._src.distributions.containers import accepted
+from jast._src.distributions.scipy_and_numpyro import OF_NUMPYRO, OF_SCIPY
 
 FROZEN = {
     "bernoulli": (0.3,),

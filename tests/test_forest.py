@@ -15,8 +15,8 @@ from systems import S0, TOLD, dice, mark_long, ring, walk
 
 import jast
 from jast import failures as F
+from jast._src.search.tree import run
 from jast.search import forest, mcts
-from jast.search.tree import run
 
 FERRY, LANDING, RING = jast.simulators.ferry(), jast.simulators.landing(b=0.2), ring()
 BONUS = jast.rewards.standard(event_bonus=30.0)

@@ -7,8 +7,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from jast import distributions as D
-from jast.cross_entropy import gaussian
-from jast.cross_entropy.gaussian import (
+from jast._src.cross_entropy import gaussian
+from jast._src.cross_entropy.gaussian import (
     Gaussian,
     as_gaussian,
     fit,

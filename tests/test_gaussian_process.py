@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from jast.cross_entropy import surrogates
-from jast.cross_entropy.surrogates import (
+from jast._src.cross_entropy import surrogates
+from jast._src.cross_entropy.surrogates import (
     JITTER,
     KERNELS,
     LENGTHSCALES,

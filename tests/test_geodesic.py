@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from geographiclib.geodesic import Geodesic
 
-from jast.simulators.fms.geodesic import EARTHS, Earth, direct, inverse, wrap
+from jast._src.simulators.fms.geodesic import EARTHS, Earth, direct, inverse, wrap
 
 pytestmark = pytest.mark.usefixtures("x64")
 R = 6378137.0

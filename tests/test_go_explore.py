@@ -15,13 +15,13 @@ from trees import large_copies
 import jast
 from benchmarks import stress_systems
 from jast import rewards
-from jast.counter import tree_keys
+from jast._src.core.counter_prng import tree_keys
+from jast._src.search.best_episodes import BestEpisodes, standard_reward
+from jast._src.search.go_explore.archive import empty_cells, features
+from jast._src.search.go_explore.go_explore import go_explore
+from jast._src.search.go_explore.phases import Plan, explore
+from jast._src.search.monte_carlo import monte_carlo
 from jast.distributions import Normal, seeds
-from jast.search.cells import empty_cells, features
-from jast.search.go_explore import go_explore
-from jast.search.kept import BestEpisodes, standard_reward
-from jast.search.monte_carlo import monte_carlo
-from jast.search.phases import Plan, explore
 
 RELATIVE = rewards.standard(density="mode")
 

@@ -13,8 +13,8 @@ from checks import archive_replays
 import jast
 from benchmarks import stress_systems
 from jast import rewards
+from jast._src.search.gradient import gradient
 from jast.distributions import Normal
-from jast.search.gradient import gradient
 
 RELATIVE = rewards.standard(density="mode")
 SMALL = dict(starts=16, refine=0.5)

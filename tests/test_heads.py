@@ -16,12 +16,9 @@ from scipy import special
 from systems import S0, dice, plane, ring
 
 import jast
-from jast.actions import quantiles, samples, uniform
-from jast.distributions.numbers import flat, unflat
-from jast.heads import MODES, Heads, Lesson, Moments, make_head, settings
-from jast.heads.heads import sample_bins, update_moments
-from jast.heads.rounds import best_trees, init_heads
-from jast.heads.samples import (
+from jast._src.distributions.flat_rows import flat, unflat
+from jast._src.heads.heads import sample_bins, update_moments
+from jast._src.heads.samples import (
     Samples,
     _episode_rows,
     _root_rows,
@@ -29,12 +26,15 @@ from jast.heads.samples import (
     samples_of_episodes,
     samples_of_roots,
 )
-from jast.heads.training import _fit, init_head, train_head
+from jast._src.heads.train_head import _fit, init_head, train_head
+from jast._src.heads.train_heads import best_trees, init_heads
+from jast._src.search.tree import forest_run as trees
+from jast._src.search.tree import run
+from jast._src.search.tree.edges import Edges
+from jast._src.search.tree.prune import Roots
+from jast.actions import quantiles, samples, uniform
+from jast.heads import MODES, Heads, Lesson, Moments, make_head, settings
 from jast.search import forest
-from jast.search.tree import grow as trees
-from jast.search.tree import run
-from jast.search.tree.edges import Edges
-from jast.search.tree.prune import Roots
 
 # --- networks
 # ----------------------------------------------------------------------------

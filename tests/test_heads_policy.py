@@ -8,9 +8,9 @@ from systems import ring, walk
 
 import jast
 from jast import actions, heads
+from jast._src.heads.train_heads import with_moments
 from jast.distributions import Independent, Normal
 from jast.heads import Heads, as_policy
-from jast.heads.rounds import with_moments
 
 LOGITS = jnp.asarray([[0.0, 1.0, -1.0, 0.5], [2.0, 0.0, 0.0, -2.0]], jnp.float32)
 

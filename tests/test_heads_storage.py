@@ -12,9 +12,10 @@ import pytest
 from jax.tree_util import Partial
 
 import jast
-from jast.heads import Head, Heads, Moments, make_head, networks
-from jast.heads.heads import policy_logits, predicted_value
-from jast.search.tree import run
+from jast._src.heads import networks
+from jast._src.heads.heads import policy_logits, predicted_value
+from jast._src.search.tree import run
+from jast.heads import Head, Heads, Moments, make_head
 
 WALK = jast.simulators.walk1d(threshold=4.0)  # one number observed, a disturbance of one
 SIZE = dict(trees=4, prunes=2, simulations=30)
@@ -355,7 +356,7 @@ def test_load_refuses_other_files(tmp_path):
     path.write_text("levels,3")
     with pytest.raises(ValueError, match="load: .*h is not a file of jast heads"):
         jast.heads.load(path)
-    jast.failures.save(path, jast.failures.empty(WALK))
+    jast.failures.save(path, jast._src.core.failures.empty(WALK))
     with pytest.raises(ValueError, match="is not a file of jast heads"):
         jast.heads.load(path)
     with pytest.raises(FileNotFoundError):

@@ -19,13 +19,13 @@ from systems import mark_long, walk
 from trees import SYSTEMS, counts_add_up, grown, large_copies, nbytes, problem, slots_of
 
 import jast
-from jast.counter import tree_keys
+from jast._src.core.counter_prng import tree_keys
+from jast._src.search.tree import layout as T
+from jast._src.search.tree import run
+from jast._src.search.tree.head_guidance import guide
+from jast._src.search.tree.packing import unpack
 from jast.heads import Heads, Moments, settings
 from jast.search import forest
-from jast.search.tree import layout as T
-from jast.search.tree import run
-from jast.search.tree.guide import guide
-from jast.search.tree.packing import unpack
 
 # --- heads that are known
 # ----------------------------------------------------------------------------

@@ -16,7 +16,10 @@ from systems import walk
 import jast
 from benchmarks.limit_states import walk_probability
 from jast import distributions as D
-from jast.distributions.mixtures import blend
+from jast._src.core.policy import Policy, nominal_policy
+from jast._src.distributions.mixtures import blend
+from jast._src.estimate.importance_sampling import LANES, chunk_size, chunks, draw_episodes
+from jast._src.runtime.progress_bar import Watch
 from jast.estimate import (
     chernoff,
     clopper_pearson,
@@ -28,10 +31,7 @@ from jast.estimate import (
     policy_proposal,
     trace_proposal,
 )
-from jast.estimate.importance_sampling import LANES, chunk_size, chunks, draw_episodes
-from jast.policy import Policy, nominal_policy
 from jast.simulators import landing, landing_probability, walk1d
-from jast.watch import Watch
 
 norm = scipy.stats.norm
 VARIANCE, MU = 0.019, 4.0236721906842e-13

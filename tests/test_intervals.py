@@ -10,9 +10,9 @@ import scipy.stats
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from jast import intervals
+from jast._src.util import intervals
+from jast._src.util.intervals import log_normal
 from jast.estimate import chernoff, clopper_pearson, jeffreys
-from jast.intervals import log_normal
 
 beta = scipy.stats.beta
 CASES = [

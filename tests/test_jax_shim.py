@@ -1,5 +1,5 @@
-"""jast._jax: what the package needs of JAX beyond its stable API. One test a piece, so that on
-another version of JAX the one that fails names what moved.
+"""jast._src.runtime._jax: what the package needs of JAX beyond its stable API. One test a piece, so
+that on another version of JAX the one that fails names what moved.
 """
 
 import ast
@@ -12,7 +12,7 @@ import pytest
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 import jast
-from jast._jax import (
+from jast._src.runtime._jax import (
     custom_vmap,
     define_prng_impl,
     host_call,
@@ -49,7 +49,7 @@ def touched(path):
 def test_one_module_alone_touches_what_may_move():
     package = Path(jast.__file__).parent
     users = {str(p.relative_to(package)) for p in package.rglob("*.py") if touched(p)}
-    assert users == {"_jax.py"}
+    assert users == {"_src/runtime/_jax.py"}
 
 
 def test_what_is_traced():

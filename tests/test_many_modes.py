@@ -9,15 +9,16 @@ import pytest
 from jax.tree_util import Partial
 
 from benchmarks.markov_systems import CASES
-from jast import limit_state as L
-from jast.estimate import failure_probability, monte_carlo, populations
-from jast.estimate.design_points import explained
-from jast.estimate.diagnostics import mode_warnings
-from jast.estimate.gaussian_family import GaussianFamily, _fit_sparse
-from jast.estimate.gaussian_start import explore_failures
-from jast.estimate.gaussians import _greatest, most_components, shrink_to_anchors
-from jast.estimate.populations import PopulationSampler, bracket_boundary, cool
-from jast.estimate.search_state import SearchState, search_context
+from jast._src.estimate import host_populations
+from jast._src.estimate.diagnostics import mode_warnings
+from jast._src.estimate.gaussians.design_points import explained
+from jast._src.estimate.gaussians.exploration import explore_failures
+from jast._src.estimate.gaussians.family import GaussianFamily, _fit_sparse
+from jast._src.estimate.gaussians.mixture_fit import _greatest, most_components, shrink_to_anchors
+from jast._src.estimate.host_populations import PopulationSampler, bracket_boundary, cool
+from jast._src.estimate.proposal_search.search_state import SearchState, search_context
+from jast._src.normal_space import transform as L
+from jast.estimate import failure_probability, monte_carlo
 from jast.simulators import limit_state
 
 FLOAT = jnp.zeros(()).dtype
@@ -89,10 +90,10 @@ def test_chains_start_where_nothing_known_explains_a_failure(key, monkeypatch):
     """Half of 64 draws fail, beyond one of two planes of which one is known; all that fail by the
     other alone are among the 16 that chains start from, and there are fewer of these without.
     """
-    monkeypatch.setattr(populations, "COOLING_STEPS", 0)
+    monkeypatch.setattr(host_populations, "COOLING_STEPS", 0)
     sim = limit_state(Partial(_either, jnp.asarray([0.5, 0.5])), 2)
     of = lambda known: (cool(key, sim, 16, design_points=known).points[:, 0] < 0.5).sum()
-    failures, *_ = populations.draw_wide_failures(key, sim, 64)
+    failures, *_ = host_populations.draw_wide_failures(key, sim, 64)
     others = (failures.z[:, 0] < 0.5).sum()
     assert of(np.array([[0.5, 0.0]])) == min(others, 16) > of(None)
 

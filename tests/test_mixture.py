@@ -8,15 +8,9 @@ import scipy.stats
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from jast.cross_entropy import gaussian, mixture
-from jast.cross_entropy.gaussian import Gaussian
-from jast.cross_entropy.mixture import (
-    Mixture,
-    em,
-    log_prob,
-    responsibilities,
-    sample,
-)
+from jast._src.cross_entropy import gaussian, mixture
+from jast._src.cross_entropy.gaussian import Gaussian
+from jast._src.cross_entropy.mixture import Mixture, em, log_prob, responsibilities, sample
 
 WEIGHTS = np.array([0.5, 0.3, 0.2])
 MEANS = np.array([[0.0, 0.0], [4.0, 1.0], [-3.0, 5.0]])

@@ -12,13 +12,14 @@ from checks import archive_replays, reward_of
 from systems import S0, mark_long, ring, two_densities, walk
 
 import jast
-from jast import actions, rewards
+from jast import actions
+from jast._src.core import rewards
+from jast._src.search.lanes import distinct_episodes
+from jast._src.search.monte_carlo import monte_carlo
 from jast.distributions import Categorical, seeds
-from jast.search.lockstep import distinct_episodes
-from jast.search.monte_carlo import monte_carlo
 
 # the package has the function by that name
-module = importlib.import_module("jast.search.monte_carlo")
+module = importlib.import_module("jast._src.search.monte_carlo")
 
 
 def lottery():

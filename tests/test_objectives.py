@@ -6,7 +6,7 @@ import scipy.optimize
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from jast.cross_entropy.objectives import ackley, branin, paraboloid, sierra
+from jast._src.cross_entropy.objectives import ackley, branin, paraboloid, sierra
 
 near = st.floats(-12, 12)
 AT = jax.jit(lambda f, x: f(x))  # one program for all sierras

@@ -12,9 +12,9 @@ from systems import ring, walk
 
 import jast
 from jast import distributions as D
-from jast.outline import Offer, ask, outline
-from jast.progress import begin
-from jast.pytrees import count_numbers
+from jast._src.core.signature import Offer, ask, outline
+from jast._src.core.transition import begin
+from jast._src.util.pytrees import count_numbers
 
 NAMES = ("start", "init", "step", "disturbance", "evaluate", "is_terminal", "observe")
 
@@ -187,7 +187,7 @@ def test_precision():
             about = outline(sim)
             assert (about.dtype, about.x.dtype, about.state.dtype) == (dtype,) * 3
             assert not about.state.weak_type
-            began = jax.eval_shape(lambda: begin(sim, jast.rewards.STANDARD, ()))
+            began = jax.eval_shape(lambda: begin(sim, jast._src.core.rewards.STANDARD, ()))
             assert {a.dtype for a in began[:4]} == {jnp.dtype(dtype)}
 
 

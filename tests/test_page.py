@@ -15,11 +15,11 @@ from browser import Page, browsed
 from reports import EVIL, SIM, estimate, made
 
 import jast
+from jast._src.page import document, episode_data, report
+from jast._src.search.refine.modes import Modes
+from jast._src.stress_testing.report_words import share_of_runs, two_digits
 from jast.distributions import Normal
 from jast.explain import Criticality, Minimal
-from jast.page import document, report, traces
-from jast.search.failure_modes import Modes
-from jast.stress_testing.words import share_of_runs, two_digits
 
 
 @pytest.fixture(scope="module")
@@ -141,7 +141,7 @@ def test_numbers_that_json_does_not_have():
 def test_long_and_wide_episodes_are_thinned(steps, width):
     x = np.random.default_rng(0).normal(size=(steps, width))
     e = jast.Episode((), x, 0.0, 0.0, True, steps, 0.0)
-    found = traces.trace(None, e, None, 1000)
+    found = episode_data.trace(None, e, None, 1000)
     shown = found["x"][0]
     assert sum(map(len, shown["columns"])) <= 1000 and found["steps"][-1] == steps
     assert len(shown["columns"]) == min(width, 24) and shown["more"] == max(0, width - 24)
@@ -160,7 +160,7 @@ def test_keys_are_no_numbers_and_x0_is_shown():
         horizon=2,
     )
     e = jast.replay(sim, jnp.ones(2), jnp.asarray(0.25))
-    found = traces.trace(sim, e, None, 1000)
+    found = episode_data.trace(sim, e, None, 1000)
     assert [group["name"] for group in found["states"]] == ["at"]
     assert found["states"][0]["columns"] == [[0.25, 1.25, 2.25]]
     assert found["x0"][0]["name"] == "x0" and found["x0"][0]["columns"] == [[0.25]]
@@ -169,7 +169,7 @@ def test_keys_are_no_numbers_and_x0_is_shown():
 
 def test_pictures_keep_to_their_room():
     states, steps = np.arange(40), list(range(0, 40, 2))
-    found = traces.pictures("html", lambda s: "x" * int(s), states, steps, 200)
+    found = episode_data.pictures("html", lambda s: "x" * int(s), states, steps, 200)
     assert sum(map(len, found["fragments"])) <= 200 and len(found["at"]) == len(steps)
     assert len(found["fragments"]) > 3 and len(found["fragments"][-1]) == steps[-1]
     assert found["at"] == sorted(found["at"])
@@ -178,13 +178,13 @@ def test_pictures_keep_to_their_room():
         (lambda s: "x" * 999, "up to 200"),
     ):
         with pytest.raises(ValueError, match=match):
-            traces.pictures("html", draw, states, steps, 200)
+            episode_data.pictures("html", draw, states, steps, 200)
 
 
 def test_a_picture_may_have_a_trail():
     states, steps = np.arange(6), list(range(6))
     draw = lambda s, past=None: f"{past.tolist()} {s}"
-    found = traces.pictures("html", draw, states, steps, 999)["fragments"]
+    found = episode_data.pictures("html", draw, states, steps, 999)["fragments"]
     assert found[0] == "[] 0" and found[3] == "[0, 1, 2] 3"
 
 
@@ -210,7 +210,7 @@ def test_the_verdict_says_whether_to_believe_it(tmp_path):
     p = estimate(warnings=(EVIL,))
     blank = p._replace(log_mean=np.nan, reliable=False, relative_error=np.nan, interval=(0, 0.003))
     quiet = made().nominal.undisturbed._replace(failure=np.True_)
-    none = made(failures=jast.failures.empty(SIM), modes=Modes())
+    none = made(failures=jast._src.core.failures.empty(SIM), modes=Modes())
     cases = {
         "No failure was found in 14": none,
         "fails without any disturbance": made(nominal=made().nominal._replace(undisturbed=quiet)),
@@ -294,7 +294,7 @@ def test_a_report_in_a_cell_of_a_notebook(monkeypatch):
     assert "UNRELIABLE" in doubtful
     assert "&lt;script&gt;fail()" in doubtful
     assert EVIL not in doubtful
-    none = made(failures=jast.failures.empty(SIM), modes=Modes())._repr_html_()
+    none = made(failures=jast._src.core.failures.empty(SIM), modes=Modes())._repr_html_()
     assert "No failure was found in 14" in none and "<img" not in none
     monkeypatch.setitem(sys.modules, "matplotlib", None)
     words = made()._repr_html_()

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import jast
-from jast.search.paths import Paths, components
+from jast._src.search.refine.connectivity import Paths, components
 
 
 class Plane(Paths):

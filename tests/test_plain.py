@@ -8,9 +8,9 @@ from scipy import stats
 from systems import line
 
 from jast import distributions as D
+from jast._src.core.signature import outline
+from jast._src.estimate.proposal_search.mixture_draws import plain_chunk
 from jast.estimate import events, monte_carlo
-from jast.estimate.batches import plain_chunk
-from jast.outline import outline
 
 SAMPLES = 20_000
 

@@ -15,6 +15,7 @@ from systems import dice, ring
 
 import jast
 from jast import plot
+from jast._src.plot import style
 from jast.distributions import Joint, MultivariateNormalDiag, Normal
 
 FERRY = jast.simulators.ferry()
@@ -158,7 +159,7 @@ def test_pictures_are_on_the_door_without_matplotlib():
 def test_the_former_order_of_arguments_warns():
     seen = []
 
-    @plot.style.result_first
+    @style.result_first
     def picture(samples, sim, value=None):
         seen.append((samples, sim, value))
 

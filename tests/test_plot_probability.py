@@ -12,10 +12,11 @@ from pictures import drawn, legend, plt, words
 
 import jast
 from jast import plot
+from jast._src.estimate.estimate import Estimate
+from jast._src.plot import style
+from jast._src.plot.style import BLUE, VERMILION
+from jast._src.search.refine.modes import Mode, Modes
 from jast.estimate import Exceedance, FailureSamples, Traces, pareto_k
-from jast.estimate.estimate import Estimate
-from jast.plot.style import BLUE, VERMILION
-from jast.search.failure_modes import Mode, Modes
 
 WALK = jast.simulators.walk1d()
 FEW = jax.device_get(
@@ -140,7 +141,7 @@ def test_probability_refuses(arguments, text):
 
 def test_a_fan_replays_every_failure():
     ax = drawn(plot.failure_fan(FAILED, WALK, lambda s: s, FEW))
-    behind = [line for line in ax.lines if line.get_color() == plot.style.GREY]
+    behind = [line for line in ax.lines if line.get_color() == style.GREY]
     lines = [
         line
         for line in ax.lines

@@ -9,8 +9,8 @@ from reports import EVIL, SIM, estimate, made
 
 import jast
 from jast import plot
+from jast._src.search.refine.modes import Mode, Modes
 from jast.distributions import seeds
-from jast.search.failure_modes import Mode, Modes
 
 
 def said(figure):
@@ -74,7 +74,7 @@ def test_without_its_simulator_a_failure_or_an_estimate():
     bare = plot.report(made(sim=None))
     assert [ax.get_ylabel() for ax in bare.axes] == ["disturbance"] * 2
     assert "not estimated" in said(bare)
-    none = plot.report(made(failures=jast.failures.empty(SIM), modes=Modes()))
+    none = plot.report(made(failures=jast._src.core.failures.empty(SIM), modes=Modes()))
     assert not none.axes and any("No failure was found in 14" in word for word in said(none))
     many = Modes(list(made().modes) * 3)
     figure = plot.report(made(modes=many), nominal=0)

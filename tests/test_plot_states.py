@@ -9,9 +9,9 @@ from systems import ring, walk
 
 import jast
 from jast import plot
+from jast._src.search.refine.modes import owners
+from jast._src.util.leaf_names import named_fields
 from jast.distributions import Joint, Normal
-from jast.fields import named_fields
-from jast.search.failure_modes import owners
 
 FERRY = jast.simulators.ferry()
 RING = ring()

@@ -7,9 +7,9 @@ import pytest
 from pictures import drawn, legend, matplotlib, plt, words
 
 from jast import plot
-from jast.plot.style import BLUE, GREY, VERMILION
-from jast.weakness.measures import auc, roc
-from jast.weakness.result import History, Result
+from jast._src.plot.style import BLUE, GREY, VERMILION
+from jast._src.weakness.measures import auc, roc
+from jast._src.weakness.result import History, Result
 
 N, CLASSES = 60, 4
 NUMBERS = np.random.default_rng(0)
@@ -148,7 +148,7 @@ def test_several_curves_have_a_name_and_a_marker_each_and_their_labels_are_apart
 
 
 def test_labels_move_as_little_as_it_takes():
-    from jast.plot.weakness import _apart
+    from jast._src.plot.weakness import _apart
 
     np.testing.assert_allclose(_apart([1, 5, 9], 1, 0, 10), [1, 5, 9])
     np.testing.assert_allclose(_apart([4, 4, 4], 1, 0, 10), [3, 4, 5])

@@ -11,20 +11,20 @@ from systems import mark_long, ring, walk
 
 import jast
 from jast import distributions as D
-from jast.cross_entropy import mixture
-from jast.cross_entropy.mixture import Mixture
-from jast.distributions.mixtures import Blended, Moved, x_of
-from jast.heads.heads import Moments
-from jast.policies.actor import (
+from jast._src.cross_entropy import mixture
+from jast._src.cross_entropy.mixture import Mixture
+from jast._src.distributions.mixtures import Blended, Moved, x_of
+from jast._src.heads.heads import Moments
+from jast._src.policies.actor import (
     Normalisation,
     count_latents,
     entropy_term,
     log_normal,
     make_networks,
 )
-from jast.policies.lanes import Transitions, add_transitions, empty_buffer, lane_at, step_lane
-from jast.policies.learner import Rates, init_learner, update
-from jast.policies.start import _first_components, fit_tilt
+from jast._src.policies.lanes import Transitions, add_transitions, empty_buffer, lane_at, step_lane
+from jast._src.policies.soft_actor_critic_training import Rates, init_learner, update
+from jast._src.policies.start_fit import _first_components, fit_tilt
 
 DISTRIBUTIONS = dict(
     normal=lambda: D.Normal(jnp.float32(1.0), jnp.float32(2.0)),

@@ -13,16 +13,12 @@ from scipy import stats
 
 import jast
 from jast import distributions as D
-from jast.counter import counter_key
-from jast.estimate import (
-    budgets,
-    failure_probability,
-    failure_samples,
-    population,
-    population_estimate,
-)
-from jast.estimate import descents as ways
-from jast.estimate.particles import (
+from jast._src.core.counter_prng import counter_key
+from jast._src.estimate import budgets
+from jast._src.estimate.population import answer
+from jast._src.estimate.population import descents as ways
+from jast._src.estimate.population.failure_sample import Sample
+from jast._src.estimate.population.particle_moves import (
     Particles,
     Steering,
     allocate_particles,
@@ -30,9 +26,9 @@ from jast.estimate.particles import (
     initial_steering,
     move_particles,
 )
-from jast.estimate.population_search import MAX_WITNESS_ERROR, answer_of
-from jast.estimate.sample import Sample
-from jast.limit_state import normal_numbers, outcomes
+from jast._src.estimate.population.search import MAX_WITNESS_ERROR, answer_of
+from jast._src.normal_space.transform import normal_numbers, outcomes
+from jast.estimate import failure_probability, failure_samples, population
 from jast.simulators import limit_state, walk1d
 
 N = 1024
@@ -431,6 +427,6 @@ def test_plain_draws_are_in_the_checkpoint(key, tmp_path, monkeypatch):
     sim = limit_state(lambda u: 1.0 - u[0], 2)
     found = population(key, sim, 100_000, particles=N, checkpoint=tmp_path)
     assert "plain draws" in found.method and found.evaluations == 100_000
-    monkeypatch.setattr(population_estimate, "simulate_points", None)
+    monkeypatch.setattr(answer, "simulate_points", None)
     again = population(key, sim, 100_000, particles=N, checkpoint=tmp_path)
     assert again.failing == found.failing and again.interval == found.interval

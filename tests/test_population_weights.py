@@ -12,9 +12,10 @@ from scipy import stats
 
 import jast
 from jast import distributions as D
-from jast.estimate import descents, population, population_weights
-from jast.estimate.sample import Sample
-from jast.limit_state import Latent
+from jast._src.estimate.population import descents, importance
+from jast._src.estimate.population.failure_sample import Sample
+from jast._src.normal_space.transform import Latent
+from jast.estimate import population
 from jast.simulators import limit_state
 
 PLANE = limit_state(lambda u: 4.0 - jnp.sum(u) / 20**0.5, 20)  # P = Phi(-4)
@@ -62,8 +63,8 @@ def test_weights_without_a_variance_are_left_after_a_pilot(key, monkeypatch, v, 
     root = np.sqrt(v, dtype=np.float32)
     one, two = np.eye(2, dtype=np.float32)[None], np.array([[4.0, 0.0]], np.float32)
     q = Latent(np.zeros(1, np.float32), two, root * one, one / root)
-    promise = population_weights.FittedProposal(q, 80_000, 1e-3)
-    monkeypatch.setattr(population_weights, "_fit_proposal", lambda *_: promise)
+    promise = importance.FittedProposal(q, 80_000, 1e-3)
+    monkeypatch.setattr(importance, "_fit_proposal", lambda *_: promise)
     found = population(key, sim, 300_000)
     assert ("importance sampling" in found.method) == serves
     assert any("no variance" in line for line in found.history) != serves
@@ -82,24 +83,26 @@ def test_where_no_gaussians_serve_populations_answer(key):
 @pytest.mark.parametrize("factor, words", [(0.5, "against populations"), (1.0, None)])
 def test_populations_check_it(key, monkeypatch, factor, words):
     """Half the probability, as where a mode were missing, is flagged."""
-    weighted = population_weights.importance_estimate
+    weighted = importance.importance_estimate
 
     def wrong(*args):
         found = weighted(*args)
         return found._replace(log_mean=found.log_mean + np.log(factor))
 
-    monkeypatch.setattr(sys.modules["jast.estimate.population"], "importance_estimate", wrong)
+    monkeypatch.setattr(
+        sys.modules["jast._src.estimate.population.population"], "importance_estimate", wrong
+    )
     found = population(key, PLANE, 300_000)
     assert found.reliable == (words is None)
     assert words is None or words in found.warnings[0]
 
 
 def test_weights_that_speak_against_themselves_are_left(key, monkeypatch):
-    drawn = population_weights.draw_estimate
+    drawn = importance.draw_estimate
     doubted = lambda *args, **more: drawn(*args, **more)._replace(
         reliable=False, warnings=("a doubt",)
     )
-    monkeypatch.setattr(population_weights, "draw_estimate", doubted)
+    monkeypatch.setattr(importance, "draw_estimate", doubted)
     found = population(key, PLANE, 300_000)
     assert "importance" not in found.method and any("a doubt" in line for line in found.history)
 
@@ -108,21 +111,21 @@ def test_an_interruption_of_the_draws_leaves_the_populations(key, monkeypatch):
     def interrupted(*args, **more):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(population_weights, "draw_estimate", interrupted)
+    monkeypatch.setattr(importance, "draw_estimate", interrupted)
     found = population(key, PLANE, 300_000)
     assert not found.reliable and "interrupted" in found.warnings[0]
     assert abs(found.log_mean - stats.norm.logsf(4)) < 4 * found.relative_error
 
 
 def test_an_interruption_of_the_pilot_is_the_end_of_the_draws(key, monkeypatch):
-    drawn, calls = population_weights.draw_estimate, []
+    drawn, calls = importance.draw_estimate, []
 
     def partly(*args, **more):
         calls.append(1)
         found = drawn(*args, **more)
         return found._replace(samples=found.samples // 2)
 
-    monkeypatch.setattr(population_weights, "draw_estimate", partly)
+    monkeypatch.setattr(importance, "draw_estimate", partly)
     found = population(key, PLANE, 300_000)
     assert len(calls) == 1 and "importance" not in found.method
     assert not found.reliable and "interrupted" in found.warnings[0]

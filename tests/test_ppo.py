@@ -11,10 +11,11 @@ from scipy import stats
 from systems import ring, walk
 
 import jast
+from jast._src.policies import proximal_training
+from jast._src.policies.actor import entropy_term, latent_mixture, make_networks
+from jast._src.policies.failure_policy import assemble
 from jast.estimate import importance, policy_proposal
-from jast.policies import FailurePolicy, ppo, proximal, sac
-from jast.policies.actor import entropy_term, latent_mixture, make_networks
-from jast.policies.failure_policy import assemble
+from jast.policies import FailurePolicy, ppo, sac
 
 TINY = dict(episodes=256, lanes=8, hidden=(8,), batch=16, epochs=2)
 SMALL = dict(episodes=2000, lanes=32, hidden=(32, 32), batch=64, learning_rate=3e-3)
@@ -44,7 +45,7 @@ def test_advantages_are_the_sums_that_define_them(trace, dtype):
     draw = np.random.default_rng(3)
     reward, value = draw.normal(size=(40, 5)), draw.normal(size=(41, 5))
     done, valid = draw.random((40, 5)) < 0.1, draw.random((40, 5)) > 0.1
-    given = proximal.advantages(
+    given = proximal_training.advantages(
         *map(jnp.asarray, (reward.astype(dtype), value.astype(dtype))), done, valid, trace
     )
     assert given.dtype == dtype
@@ -60,7 +61,7 @@ def test_advantages_are_the_sums_that_define_them(trace, dtype):
 def test_the_advantage_of_a_whole_return_needs_no_value_but_its_own():
     """Trace 1: what an episode pays from here on, less the value here."""
     reward, value = jnp.array([1.0, 2.0, 4.0]), jnp.array([10.0, 20.0, 30.0, 99.0])
-    given = proximal.advantages(
+    given = proximal_training.advantages(
         reward, value, jnp.array([False, False, True]), jnp.ones(3, bool), 1.0
     )
     np.testing.assert_allclose(given, [7 - 10, 6 - 20, 4 - 30])
@@ -80,15 +81,15 @@ def test_the_advantage_of_a_whole_return_needs_no_value_but_its_own():
 def test_the_clipped_objective_and_its_slope(ratio, advantage, value, slope, dtype):
     """min(r A, clip(r, .8, 1.2) A); its slope in log r is r A, or 0 where clipping wins."""
     log_ratio, advantage = jnp.log(jnp.asarray(ratio, dtype)), jnp.asarray(advantage, dtype)
-    given = jax.value_and_grad(proximal.surrogate)(log_ratio, advantage, 0.2)
+    given = jax.value_and_grad(proximal_training.surrogate)(log_ratio, advantage, 0.2)
     np.testing.assert_allclose(given, (value, slope), rtol=1e-6)
 
 
 def drawn(key, n=64):
     """A learner, its functions, rates and a batch of ``n`` draws of a policy of one component."""
-    rates = proximal.Rates(*(jnp.float32(v) for v in (0.01, 0.2, 0.95, 1.0, 0.0, 100.0)))
+    rates = proximal_training.Rates(*(jnp.float32(v) for v in (0.01, 0.2, 0.95, 1.0, 0.0, 100.0)))
     _, applies = make_networks(2, (8,), 1)
-    new = proximal.init_learner(key, 1, 2, (8,), 1, rates.alpha)
+    new = proximal_training.init_learner(key, 1, 2, (8,), 1, rates.alpha)
     for_inputs, for_z, for_numbers = jax.random.split(key, 3)
     inputs = jax.random.normal(for_inputs, (n, 3), jnp.float32)
     z = jax.random.normal(for_z, (n, 2), jnp.float32)
@@ -100,7 +101,7 @@ def drawn(key, n=64):
         new,
         applies,
         rates,
-        proximal.Batch(inputs, z, log_pi, advantage, goal, jnp.ones(n, jnp.float32)),
+        proximal_training.Batch(inputs, z, log_pi, advantage, goal, jnp.ones(n, jnp.float32)),
     )
 
 
@@ -109,7 +110,7 @@ def test_an_update_goes_along_the_gradients(key):
     the actor, whose ratio is still 1, of the mean of A log pi.
     """
     old, applies, rates, batch = drawn(key)
-    new, loss = jax.jit(proximal.update, static_argnums=1)(
+    new, loss = jax.jit(proximal_training.update, static_argnums=1)(
         old, applies, rates, jnp.float32(0.01), batch
     )
 
@@ -146,7 +147,7 @@ def test_a_step_of_weight_0_is_not_learned_from(key, equal):
     clean = spoilt._replace(
         advantage=jnp.where(half, batch.advantage, 0), target=jnp.where(half, batch.target, 0)
     )
-    step = jax.jit(proximal.update, static_argnums=1)
+    step = jax.jit(proximal_training.update, static_argnums=1)
     one, other = (step(old, applies, rates, jnp.float32(0.01), b) for b in (spoilt, clean))
     equal(one, other)
 
@@ -167,7 +168,7 @@ def shares(key, policy, sim=ONE_SIDED, n=4000):
 def test_a_learned_policy_fails_far_more_often_than_one_that_learned_nothing(learned, key):
     """By .3 and 4 standard errors of the difference; the model itself fails in one of 1044."""
     n, apply = 1, learned.disturbance.args[1]
-    new = proximal.init_learner(key, n, n, SMALL["hidden"], 2, jnp.float32(1)).actor
+    new = proximal_training.init_learner(key, n, n, SMALL["hidden"], 2, jnp.float32(1)).actor
     nothing = assemble(ONE_SIDED, apply, True, learned.learned._replace(actor=new), learned.history)
     for_new, for_learned = jax.random.split(key)
     untrained, error = shares(for_new, nothing)
@@ -250,7 +251,7 @@ def test_an_interruption_before_anything_was_learned_is_raised(monkeypatch):
     def stop(*args):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(proximal, "train", stop)
+    monkeypatch.setattr(proximal_training, "train", stop)
     with pytest.raises(KeyboardInterrupt):
         ppo(jax.random.key(3), WALK, **TINY)
 

@@ -12,8 +12,8 @@ from systems import mark_long
 import jast
 from benchmarks import limit_states
 from benchmarks.limit_states import autoregression_probability
+from jast._src.simulators.pendulum import PendulumState
 from jast.simulators import autoregression, pendulum, ruin, ruin_probability
-from jast.simulators.pendulum import PendulumState
 
 ALL = {"pendulum": pendulum, "autoregression": autoregression, "ruin": ruin}
 # parameters unlike the defaults, by position

@@ -11,20 +11,14 @@ import pytest
 
 import jast
 from benchmarks.stress_systems import CASES, linear
-from jast import limit_state as latent
-from jast.distributions import (
-    Exponential,
-    Laplace,
-    MultivariateNormalDiag,
-    Normal,
-    tent,
-    where,
-)
+from jast._src.normal_space import transform as latent
+from jast._src.normal_space.mode_coordinates import centred
+from jast._src.search.refine import refine as refinement
+from jast._src.search.refine.modes import modes
+from jast.distributions import Exponential, Laplace, MultivariateNormalDiag, Normal, tent, where
 from jast.failures import collect
 from jast.rewards import likelihood
-from jast.search import refine, refinement
-from jast.search.centred import centred
-from jast.search.failure_modes import modes
+from jast.search import refine
 
 
 def draws(sim, scale, n=300, seed=0):

@@ -11,7 +11,7 @@ import pytest
 from systems import mark_long
 
 import jast
-from jast import results
+from jast._src.util import display
 
 KEY = jax.random.key(0)
 
@@ -60,7 +60,7 @@ MAKERS = {
     "nominal": lambda: jast.nominal(KEY, WALK, episodes=500),
     "failure_proposal": lambda: jast.estimate.failure_proposal(KEY, WALK, samples=200),
     "failure_samples": lambda: jast.estimate.failure_samples(
-        KEY, WALK, jast.policy.nominal_policy(WALK), 5, moves=1
+        KEY, WALK, jast._src.core.policy.nominal_policy(WALK), 5, moves=1
     ),
     "sac": lambda: jast.policies.sac(KEY, WALK, episodes=400, lanes=16, hidden=(8,)),
     "validation": validation,
@@ -69,7 +69,7 @@ OTHERS = {
     "episode": lambda: made("monte_carlo").best,
     "failures": lambda: made("monte_carlo").failures,
     "simulator": lambda: WALK,
-    "policy": lambda: jast.policy.nominal_policy(WALK),
+    "policy": lambda: jast._src.core.policy.nominal_policy(WALK),
     "proposal": lambda: jast.estimate.trace_proposal(WALK, made("monte_carlo").best),
     "heads": heads,
     "traces": lambda: jast.estimate.log_weights(KEY, WALK, OTHERS["policy"](), 20),
@@ -102,7 +102,7 @@ def test_a_repr_is_short_and_the_table_of_a_notebook_names_every_field(name):
 def test_every_result_has_the_whole_vocabulary(name):
     value = made(name)
     left = {"failures"} | ({"episodes"} if name == "failure_samples" else set())  # former names
-    whole = {word: getattr(value, word) for word in results.VOCABULARY if word not in left}
+    whole = {word: getattr(value, word) for word in display.VOCABULARY if word not in left}
     assert name == "failure_samples" or whole["episodes"] is not None
     assert np.ndim(whole.get("episodes", 0)) == 0
     assert whole["settings"] is None or isinstance(whole["settings"], dict)
@@ -164,7 +164,7 @@ def test_a_repr_does_not_raise_whatever_the_leaves_are():
 
 
 def test_html_is_escaped():
-    table = results.html_table("a<b", {"x": "<script>"})
+    table = display.html_table("a<b", {"x": "<script>"})
     assert "<script>" not in table
     assert "&lt;script&gt;" in table
     assert "a&lt;b" in table
@@ -267,10 +267,11 @@ def test_a_file_gives_the_result_back_to_the_bit(name, tmp_path):
 
 
 def test_a_file_with_former_names_of_fields_is_read(tmp_path):
-    from jast import archive, files
+    from jast._src.io import npz as archive
+    from jast._src.io import save_load
 
     value, path = made("failure_samples"), tmp_path / "r"
-    header, arrays = files.parts(value)
+    header, arrays = save_load.parts(value)
     fields = header["result"]["record"][1]
     fields["episodes"] = fields.pop("failures")  # as the version before wrote it
     archive.write(path, "jast result", 1, header, arrays)
@@ -357,7 +358,8 @@ def test_what_a_file_cannot_hold_is_named(tmp_path):
 
 
 def test_bad_files_are_refused(tmp_path, monkeypatch):
-    from jast import archive, files
+    from jast._src.io import npz as archive
+    from jast._src.io import save_load
 
     path = tmp_path / "r"
     jast.save(path, made("monte_carlo"))
@@ -387,7 +389,7 @@ def test_bad_files_are_refused(tmp_path, monkeypatch):
         jast.load(path)
     with pytest.raises(FileNotFoundError):
         jast.load(tmp_path / "none")
-    archive.write(path, "jast result", 1, *files.parts(made("nominal")))
+    archive.write(path, "jast result", 1, *save_load.parts(made("nominal")))
     monkeypatch.setattr(archive, "_checksum", lambda *_: "other")
     with pytest.raises(ValueError, match="its checksum does not match"):
         jast.load(path)

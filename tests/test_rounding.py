@@ -8,8 +8,8 @@ import pytest
 
 import jast
 from jast import distributions as D
+from jast._src.core.float_resolution import rounding_problem
 from jast.estimate import failure_probability
-from jast.rounding import rounding_problem
 
 
 def walk(offset, idle=0.0):

@@ -173,12 +173,12 @@ def test_a_checkpoint_of_another_training_is_refused(whole_run):
 
 
 def test_an_interruption_before_anything_was_learned_is_raised(monkeypatch):
-    from jast.policies import learner
+    from jast._src.policies import soft_actor_critic_training
 
     def stop(*args):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(learner, "train", stop)
+    monkeypatch.setattr(soft_actor_critic_training, "train", stop)
     with pytest.raises(KeyboardInterrupt):
         sac(jax.random.key(3), WALK, **TINY)
 

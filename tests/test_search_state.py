@@ -8,13 +8,11 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal, norm
 
-from jast.estimate import search_settings
-from jast.estimate.adapt import adapt_proposal
-from jast.estimate.gaussian_family import GaussianFamily, Points
-from jast.estimate.gaussians import as_latent, unit_gaussians
-from jast.estimate.markov_tilts import simulate_points
-from jast.estimate.search_settings import SETTINGS
-from jast.estimate.search_state import (
+from jast._src.estimate.gaussians.family import GaussianFamily, Points
+from jast._src.estimate.gaussians.mixture_fit import as_latent, unit_gaussians
+from jast._src.estimate.proposal_search import settings
+from jast._src.estimate.proposal_search.adapt import adapt_proposal
+from jast._src.estimate.proposal_search.search_state import (
     SearchState,
     add_batch,
     efficiency,
@@ -22,7 +20,9 @@ from jast.estimate.search_state import (
     is_efficient,
     search_context,
 )
-from jast.estimate.tilt_family import TiltFamily
+from jast._src.estimate.proposal_search.settings import SETTINGS
+from jast._src.estimate.tilts.family import TiltFamily
+from jast._src.estimate.tilts.tilts import simulate_points
 from jast.simulators import limit_state, ruin
 
 D, BETA = 3, 3.0
@@ -156,9 +156,7 @@ def test_points_of_tilts_are_played_again(key):
 def test_every_number_of_the_search_has_its_reason():
     """A string under each field."""
     [body] = [
-        n.body
-        for n in ast.parse(inspect.getsource(search_settings)).body
-        if isinstance(n, ast.ClassDef)
+        n.body for n in ast.parse(inspect.getsource(settings)).body if isinstance(n, ast.ClassDef)
     ]
     fields = [i for i, n in enumerate(body) if isinstance(n, ast.AnnAssign)]
     assert len(fields) == len(SETTINGS)

@@ -12,7 +12,9 @@ from systems import ring, walk
 import jast
 from jast import actions
 from jast import distributions as D
-from jast.cross_entropy.sequences import (
+from jast._src.core.signature import outline
+from jast._src.distributions.normal_tails import normal_score
+from jast._src.normal_space.sequences import (
     Steps,
     disturbance_at,
     fit,
@@ -21,8 +23,6 @@ from jast.cross_entropy.sequences import (
     sample,
     standard_normal,
 )
-from jast.distributions.numerics import normal_score
-from jast.outline import outline
 
 
 def scalar(dtype):

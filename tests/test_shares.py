@@ -11,14 +11,15 @@ import pytest
 from jax.tree_util import Partial
 from scipy import stats
 
-from jast import intervals, records
+from jast._src.estimate.population.descents import by_distance
+from jast._src.estimate.population.failure_sample import sample_from
+from jast._src.io import codec
+from jast._src.normal_space.transform import Latent, normal_numbers, played
+from jast._src.search.refine.modes import UNKNOWN, Mode, Modes
+from jast._src.stress_testing.mode_shares import corrected_shares, mode_shares, shares_cost
+from jast._src.util import intervals
 from jast.estimate import clopper_pearson
-from jast.estimate.descents import by_distance
-from jast.estimate.sample import sample_from
-from jast.limit_state import Latent, normal_numbers, played
-from jast.search.failure_modes import UNKNOWN, Mode, Modes
 from jast.simulators import limit_state
-from jast.stress_testing.shares import corrected_shares, mode_shares, shares_cost
 
 BUDGET = 10_000
 
@@ -209,8 +210,8 @@ def test_a_share_in_words_and_in_files(key):
     assert first._replace(share_interval=UNKNOWN).share_words == "52 %"
     assert first._replace(share=1.0, share_interval=(1.0, 1.0)).share_words == "100 %"
     arrays, bare = {}, first._replace(failure=None)
-    node = records.encode(bare, arrays, lambda value: None)
-    again = lambda: records.decode(node, "file", arrays, lambda node: node, None)
+    node = codec.encode(bare, arrays, lambda value: None)
+    again = lambda: codec.decode(node, "file", arrays, lambda node: node, None)
     assert again() == bare
     del node["record"][1]["share_interval"]  # as before there were any
     assert np.isnan(again().share_interval).all() and again().share == bare.share

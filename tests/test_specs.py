@@ -10,10 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from jax.tree_util import Partial
 
+from jast._src.specs.formulas import Implies, Junction, Not, Predicate, Temporal, Until, predicates
+from jast._src.specs.monitor import begin, push
+from jast._src.specs.robustness import fits
 from jast.specs import always, eventually, implies, parts, predicate, robustness, until
-from jast.specs.formulas import Implies, Junction, Not, Predicate, Temporal, Until, predicates
-from jast.specs.monitor import begin, push
-from jast.specs.robustness import fits
 
 T = 7
 X = predicate(lambda s: s["x"], "x > 0")

@@ -8,7 +8,7 @@ import pytest
 
 from benchmarks.literature import CASES, collision_avoidance, table
 from benchmarks.structural import PROBLEMS
-from jast.judge import judged
+from jast._src.normal_space.evaluate_points import judged
 
 DRAWS = 20_000
 

@@ -16,13 +16,13 @@ from reports import estimate
 from systems import above
 
 import jast
-from jast.crude import Nominal
+from jast._src.core.nominal import Nominal
+from jast._src.estimate.tilts.fit import as_tilts, of_tilts
+from jast._src.estimate.tilts.tilts import Tilts
+from jast._src.sweeping.simulators import count_kinds, make_simulators
+from jast._src.util.intervals import clopper_pearson
 from jast.estimate import failure_probability
-from jast.estimate.markov_tilts import Tilts
-from jast.estimate.tilt_fit import as_tilts, of_tilts
-from jast.intervals import clopper_pearson
 from jast.sweeping import Sweep
-from jast.sweeping.batch import count_kinds, make_simulators
 
 LIMITS = (0.5, 1.0, 1.5, 2.0)
 

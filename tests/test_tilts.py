@@ -17,10 +17,15 @@ from benchmarks.limit_states import autoregression_probability, draw, ruin_proba
 from benchmarks.markov_systems import CASES
 from benchmarks.stress_systems import latch
 from jast import distributions as D
-from jast.distributions.parts import parts
-from jast.estimate import failure_probability, failure_samples
-from jast.estimate.adapt import adapt_proposal
-from jast.estimate.markov_tilts import (
+from jast._src.distributions.independent_parts import parts
+from jast._src.estimate.proposal_search.adapt import adapt_proposal
+from jast._src.estimate.proposal_search.search_state import SearchState, search_context
+from jast._src.estimate.proposal_search.settings import SETTINGS
+from jast._src.estimate.tilts.exploration import descend_levels
+from jast._src.estimate.tilts.family import Mixture, TiltFamily
+from jast._src.estimate.tilts.fit import as_tilts, fit_tilt, frame_of, log_ratios, steps_of
+from jast._src.estimate.tilts.replay import numbers_of_episodes
+from jast._src.estimate.tilts.tilts import (
     assemble,
     log_weight,
     random_numbers,
@@ -29,13 +34,8 @@ from jast.estimate.markov_tilts import (
     simulate_tilts,
     stack_choices,
 )
-from jast.estimate.recorded_tilts import numbers_of_episodes
-from jast.estimate.search_settings import SETTINGS
-from jast.estimate.search_state import SearchState, search_context
-from jast.estimate.tilt_family import Mixture, TiltFamily
-from jast.estimate.tilt_fit import as_tilts, fit_tilt, frame_of, log_ratios, steps_of
-from jast.estimate.tilt_start import descend_levels
-from jast.limit_state import normal_numbers
+from jast._src.normal_space.transform import normal_numbers
+from jast.estimate import failure_probability, failure_samples
 from jast.simulators import autoregression, ruin
 
 BUDGET = 10_000

@@ -12,8 +12,8 @@ from systems import dice, line, ring, walk
 
 import jast
 from jast import distributions as D
-from jast import traps as T
-from jast.traps import traps
+from jast._src.core import traps as T
+from jast._src.core.traps import traps
 
 
 def told(sim, words):

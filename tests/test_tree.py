@@ -29,12 +29,12 @@ from trees import (
 )
 
 import jast
-from jast.counter import tree_keys
+from jast._src.core.counter_prng import tree_keys
+from jast._src.search.tree import layout as T
+from jast._src.search.tree import packing as records
+from jast._src.search.tree import run
+from jast._src.search.tree.packing import pack, unpack
 from jast.search import forest
-from jast.search.tree import layout as T
-from jast.search.tree import packing as records
-from jast.search.tree import run
-from jast.search.tree.packing import pack, unpack
 
 SIZE = dict(trees=5, prunes=3, simulations=120, lanes=3, threads=1)
 

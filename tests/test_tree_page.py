@@ -7,7 +7,7 @@ from browser import Page, browsed
 from systems import TOLD, ring, walk
 
 import jast
-from jast.page.nodes import nodes_of
+from jast._src.page.tree_nodes import nodes_of
 
 CASES = {
     "ring": (ring(), TOLD),
@@ -61,7 +61,7 @@ def test_what_is_kept_is_the_tree(name, found):
             assert nodes.visits[n] == 1 + nodes.visits[nodes.children(n)].sum()
         assert nodes.failing[0] == (trees.failure & (trees.visits > 0))[:, lane].sum()
     archive, seen = result.failures, 0
-    start = jast.outline.outline(sim).random_start
+    start = jast._src.core.signature.outline(sim).random_start
     for i, episode in enumerate(archive):
         lane, simulation = int(archive.tree[i]), int(archive.simulation[i])
         if lane < 0:
@@ -117,7 +117,7 @@ def test_a_file_keeps_the_trees(found, tmp_path):
 
 
 def test_a_large_tree_is_cut_where_it_was_visited_least(found, tmp_path, monkeypatch):
-    from jast.page import tree as page
+    from jast._src.page import tree as page
 
     monkeypatch.setattr(page, "BYTES", 3000)
     jast.plot.tree_page(found, tmp_path / "t.html", tree=0)

@@ -22,24 +22,30 @@ import pytest
 from systems import line
 
 import jast
-from jast import places, units
-from jast.checkpoints import PARTS, Checkpoint, RecordFile, open_checkpoint, read_records
+from jast._src.core.policy import nominal_policy
+from jast._src.estimate import importance_sampling
+from jast._src.io.fingerprint import describe_differences, fingerprint
+from jast._src.runtime import backends, work
+from jast._src.runtime.backends import Task
+from jast._src.runtime.checkpoints import (
+    PARTS,
+    Checkpoint,
+    RecordFile,
+    open_checkpoint,
+    read_records,
+)
+from jast._src.runtime.progress_bar import Watch
 from jast.estimate import (
     Estimate,
     failure_probability,
     failure_samples,
     importance,
-    importance_sampling,
     policy_proposal,
     subset_simulation,
 )
-from jast.fingerprint import describe_differences, fingerprint
-from jast.places import Task
 from jast.policies import sac
-from jast.policy import nominal_policy
 from jast.search import cem, chain, falsify, forest, go_explore, gradient, mcts, monte_carlo
 from jast.simulators import ferry, walk1d
-from jast.watch import Watch
 from jast.weakness import default, validate
 
 ROOT = Path(__file__).parents[1]
@@ -71,7 +77,7 @@ LATER = ("mcts", "importance", "failure_probability")
 @pytest.fixture(autouse=True)
 def small_units(monkeypatch):
     monkeypatch.setattr(importance_sampling, "LANES", 1000)
-    monkeypatch.setattr(sys.modules["jast.search.monte_carlo"], "LANES", 512)
+    monkeypatch.setattr(sys.modules["jast._src.search.monte_carlo"], "LANES", 512)
 
 
 class Full:
@@ -153,10 +159,10 @@ class Closing:
 
 def squares(n=5, function=square, executor=None, **how):
     watch = Watch("squares", n, "unit", False, how.pop("callback", None))
-    ways = units.placement("squares", executor, how.pop("devices", None))
+    ways = work.placement("squares", executor, how.pop("devices", None))
     like = lambda: 0
     fold = lambda state, number, result: (*state, int(result))
-    return units.run(Task(function, None, like), n, fold, (), watch, ways, **how)
+    return work.run(Task(function, None, like), n, fold, (), watch, ways, **how)
 
 
 # --- where units run, and from where they go on
@@ -180,13 +186,13 @@ def test_no_place_changes_a_result(name, key, same, tmp_path):
 
 def test_what_is_done_is_not_done_again(key, tmp_path, monkeypatch, same):
     call, done = CALLS["nominal"], []
-    real = sys.modules["jast.crude"]._unit
+    real = sys.modules["jast._src.core.nominal"]._unit
 
     def unit(job, number, post):
         done.append(number)
         return real(job, number, post)
 
-    monkeypatch.setattr(sys.modules["jast.crude"], "_unit", unit)
+    monkeypatch.setattr(sys.modules["jast._src.core.nominal"], "_unit", unit)
 
     def stop(done, total, _):
         raise KeyboardInterrupt
@@ -344,7 +350,7 @@ def test_a_unit_that_goes_on_failing_is_left_out_and_told():
     assert ran.done == 5
     (incident,) = ran.incidents
     assert "ZeroDivisionError: one" in str(incident) and "make the same call again" in str(incident)
-    assert "units 1 are left out" in units.describe_missing("units", ran, 4, 5)
+    assert "units 1 are left out" in work.describe_missing("units", ran, 4, 5)
 
 
 def test_where_all_units_fail_the_call_says_why():
@@ -357,15 +363,15 @@ def test_where_all_units_fail_the_call_says_why():
 def test_an_executor_that_is_shut_down_leaves_what_is_done():
     ran = squares(n=600, executor=Closing(after=300))
     assert 0 < len(ran.state) < 600 and list(ran.state) == [i**2 for i in range(len(ran.state))]
-    assert "cannot schedule new futures" in units.describe_missing("units", ran, ran.done, 600)
+    assert "cannot schedule new futures" in work.describe_missing("units", ran, ran.done, 600)
     with pytest.raises(RuntimeError, match="squares: the executor takes no more work"):
         squares(executor=Closing(after=1))
 
 
 def test_an_executor_with_other_versions_is_refused(monkeypatch):
-    here = places.versions()
+    here = backends.versions()
     answers = iter([here, here | {"jax": "0.1.0"}])
-    monkeypatch.setattr(places, "versions", lambda: next(answers))
+    monkeypatch.setattr(backends, "versions", lambda: next(answers))
     with ThreadPoolExecutor(1) as executor:
         with pytest.raises(ValueError, match="squares: .*other versions.*jax is 0.1.0 there"):
             squares(n=1, executor=executor)

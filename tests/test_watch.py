@@ -4,7 +4,7 @@ import re
 
 import pytest
 
-from jast.watch import Watch, in_pieces
+from jast._src.runtime.progress_bar import Watch, in_pieces
 
 
 def watched(callback):

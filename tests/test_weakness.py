@@ -9,9 +9,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from sklearn.metrics import roc_auc_score, roc_curve
 
-from jast import archive, weakness
-from jast.checkpoints import Checkpoint
-from jast.counter import numpy_generator
+from jast import weakness
+from jast._src.core.counter_prng import numpy_generator
+from jast._src.io import npz
+from jast._src.runtime.checkpoints import Checkpoint
 from jast.weakness import Selector, Step, validate
 
 KEY = jax.random.key(0)
@@ -214,7 +215,7 @@ def test_a_checkpoint_holds_every_answer(tmp_path):
     system = Flaky(answers, 38, SystemExit())  # what nothing catches
     with pytest.raises(SystemExit):
         validate(KEY, system, inputs, labels, selector=in_turn(), checkpoint=path)
-    _, state = archive.read(path / "state.jast", {"jast checkpoint state": 1}, "a state")
+    _, state = npz.read(path / "state.jast", {"jast checkpoint state": 1}, "a state")
     assert len(state["order"]) == 35
     same(validate(KEY, system, inputs, labels, selector=in_turn(), checkpoint=path), whole)
     assert len(system.asked) == 60

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from jast.weakness.data import digits, from_idx, idx
+from jast._src.weakness.data import digits, from_idx, idx
 
 MNIST = Path(__file__).resolve().parents[2] / "shared" / "data" / "mnist"
 CODES = {

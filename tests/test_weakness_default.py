@@ -15,12 +15,13 @@ from sklearn.linear_model import LogisticRegression
 from sklearn.neighbors import NearestNeighbors
 
 from jast import weakness
-from jast.weakness import committee, residual, validate, views
-from jast.weakness.contract import Seen
-from jast.weakness.data import Data
+from jast._src.weakness import committee, failure_odds, features
+from jast._src.weakness.data import Data
+from jast._src.weakness.selector_contract import Seen
+from jast.weakness import validate
 
 # the package's own `default` is the function
-selector = importlib.import_module("jast.weakness.default")
+selector = importlib.import_module("jast._src.weakness.default_selector")
 KEY = jax.random.key(0)
 
 
@@ -138,7 +139,7 @@ def test_who_has_not_learned_from_an_input_judges_it(monkeypatch):
 
 def test_an_answer_does_not_move_its_own_score():
     inputs, labels = table(200)
-    x, rng = views.scale_inputs(Data(inputs, labels, 3)), lambda: np.random.default_rng(5)
+    x, rng = features.scale_inputs(Data(inputs, labels, 3)), lambda: np.random.default_rng(5)
     learn, data = committee.folds(rng(), 200), Data(inputs, labels, 3)
     other = labels.copy()
     other[17] = (labels[17] + 1) % 3
@@ -171,19 +172,21 @@ def test_the_regression_is_the_most_probable(separable):
     rng = np.random.default_rng(0)
     rows = np.c_[rng.normal(size=(80, 2)) * 3, np.ones(80)]
     failed = (
-        rows[:, 0] > 0 if separable else rng.random(80) < residual.sigmoid(rows @ [0.7, -0.2, -1.0])
+        rows[:, 0] > 0
+        if separable
+        else rng.random(80) < failure_odds.sigmoid(rows @ [0.7, -0.2, -1.0])
     )
     mean, precision = np.array([0.5, 0.0, -0.5]), np.array([4.0, 2.0, 1.0])
     cost = lambda b: (
         np.logaddexp(0, rows @ b).sum() - failed @ (rows @ b) + 0.5 * precision @ (b - mean) ** 2
     )
-    found = residual.fit_logistic(rows, failed, mean, precision)
+    found = failure_odds.fit_logistic(rows, failed, mean, precision)
     np.testing.assert_allclose(found, minimize(cost, mean, tol=1e-12).x, atol=1e-4)
 
 
 def test_nothing_seen_leaves_the_prior():
     np.testing.assert_array_equal(
-        residual.fit_logistic(
+        failure_odds.fit_logistic(
             np.zeros((0, 5)), np.zeros(0, bool), selector.PRIOR, selector.PRECISION
         ),
         selector.PRIOR,
@@ -193,12 +196,12 @@ def test_nothing_seen_leaves_the_prior():
 def test_laplace_against_scikit_learn():
     rng = np.random.default_rng(0)
     x = rng.normal(size=(60, 2))
-    failed = rng.random(60) < residual.sigmoid(3 * x[:, 0])
+    failed = rng.random(60) < failure_odds.sigmoid(3 * x[:, 0])
     kernel = ConstantKernel(4.0, "fixed") * RBF(1.5, "fixed")
     theirs = GaussianProcessClassifier(kernel, optimizer=None, max_iter_predict=1000).fit(x, failed)
-    matrix = residual._kernel(views.squared_distances(x, x), 1.5**2, 4.0, 1.0)
+    matrix = failure_odds._kernel(features.squared_distances(x, x), 1.5**2, 4.0, 1.0)
     np.testing.assert_allclose(matrix, kernel(x), rtol=1e-10)
-    evidence, slope = residual._laplace(matrix, failed.astype(float), np.zeros(60))
+    evidence, slope = failure_odds._laplace(matrix, failed.astype(float), np.zeros(60))
     assert evidence == pytest.approx(theirs.log_marginal_likelihood_value_, abs=1e-3)
     new = rng.normal(size=(9, 2))
     latent = kernel(new, x) @ (theirs.base_estimator_.y_train_ - theirs.base_estimator_.pi_)
@@ -209,9 +212,11 @@ def test_the_mode_on_top_of_given_odds():
     rng = np.random.default_rng(1)
     x, mean = rng.normal(size=(40, 2)), rng.normal(size=40) * 3 - 4
     target = (rng.random(40) < 0.3).astype(float)
-    matrix = residual._kernel(views.squared_distances(x, x), 1.0, 16.0, 1.0)
-    slope = residual._laplace(matrix, target, mean)[1]
-    np.testing.assert_allclose(target - residual.sigmoid(mean + matrix @ slope), slope, atol=2e-3)
+    matrix = failure_odds._kernel(features.squared_distances(x, x), 1.0, 16.0, 1.0)
+    slope = failure_odds._laplace(matrix, target, mean)[1]
+    np.testing.assert_allclose(
+        target - failure_odds.sigmoid(mean + matrix @ slope), slope, atol=2e-3
+    )
 
 
 def test_the_residual_finds_a_region_and_nothing_where_there_is_none():
@@ -220,7 +225,7 @@ def test_the_residual_finds_a_region_and_nothing_where_there_is_none():
     odds = np.full(600, -4.0)
     region = (labels == 1) & (close[:, 0] > 0.5)
     order = rng.permutation(600)[:300]
-    found = residual.residual_log_odds(
+    found = failure_odds.residual_log_odds(
         rng, close, labels, odds, seen_of(order, np.where(region, 0, labels), labels)
     )
     rest = np.setdiff1d(np.arange(600), order)
@@ -233,9 +238,9 @@ def test_the_residual_finds_a_region_and_nothing_where_there_is_none():
     )
     assert found[labels == 0].max() < 1
     # what the odds say, and no more
-    fair = np.where(rng.random(600) < residual.sigmoid(odds), 1 - labels, labels)
+    fair = np.where(rng.random(600) < failure_odds.sigmoid(odds), 1 - labels, labels)
     np.testing.assert_array_equal(
-        residual.residual_log_odds(rng, close, labels, odds, seen_of(order, fair, labels)), 0
+        failure_odds.residual_log_odds(rng, close, labels, odds, seen_of(order, fair, labels)), 0
     )
 
 
@@ -243,7 +248,7 @@ def test_views_of_a_table_do_not_depend_on_units():
     inputs, labels = table(300)
     inputs = np.c_[inputs, np.full(300, 7.0)]  # a column that never varies
     a, b = (
-        views.make_views(Data(x, labels, 3), np.zeros((300, 0)))
+        features.make_views(Data(x, labels, 3), np.zeros((300, 0)))
         for x in (inputs, inputs * [1, 0.001, 5, 1, 1, 1, 3] + 4)
     )
     np.testing.assert_allclose(a.scaled, b.scaled, atol=1e-5)
@@ -258,7 +263,7 @@ def test_views_of_a_table_do_not_depend_on_units():
 def test_small_differences_on_a_large_mean_are_seen():
     images = np.random.default_rng(0).normal(size=(30, 4, 4))
     near, far = (
-        views.scale_inputs(Data(x, np.zeros(30, np.int32), 2)) for x in (images, images + 1e8)
+        features.scale_inputs(Data(x, np.zeros(30, np.int32), 2)) for x in (images, images + 1e8)
     )
     np.testing.assert_allclose(near, far, atol=1e-5)
 
@@ -267,14 +272,14 @@ def test_views_of_images_keep_their_shades():
     images = np.random.default_rng(0).uniform(0, 255, (40, 5, 5)).astype(np.uint8)
     images[0, 0, 0], images[0, 0, 1] = 0, 255
     data = Data(images, np.zeros(40, np.int32), 2)
-    assert views.reduce_inputs(None, data).shape == (40, 0)
-    seen_as = views.make_views(data, views.reduce_inputs(None, data))
+    assert features.reduce_inputs(None, data).shape == (40, 0)
+    seen_as = features.make_views(data, features.reduce_inputs(None, data))
     np.testing.assert_allclose(seen_as.scaled, images.reshape(40, 25) / np.float32(255), atol=1e-6)
     assert np.std(seen_as.centred) == pytest.approx(0.4, rel=1e-4)
     assert all(a.dtype == np.float32 for a in seen_as)
     centred, close = (
         seen_as.centred.astype(float),
-        views.principal_components(None, seen_as.centred, 64).astype(float),
+        features.principal_components(None, seen_as.centred, 64).astype(float),
     )
     assert close.shape == (40, 25)
     distance = np.linalg.norm(centred[3] - centred[9])
@@ -283,14 +288,14 @@ def test_views_of_images_keep_their_shades():
 
 
 def test_wide_inputs_are_seen_by_their_components(monkeypatch):
-    monkeypatch.setattr(views, "WIDE", 50)
-    monkeypatch.setattr(views, "KEPT", 4)
+    monkeypatch.setattr(features, "WIDE", 50)
+    monkeypatch.setattr(features, "KEPT", 4)
     rng = np.random.default_rng(0)
     hidden = rng.normal(size=(200, 3)) * [5, 3, 2]
     wide = (hidden @ rng.normal(size=(3, 400))).reshape(200, 20, 20)
     data = Data(wide, np.zeros(200, np.int32), 2)
-    reduced = views.reduce_inputs(np.random.default_rng(1), data)
-    seen_as = views.make_views(data, reduced)
+    reduced = features.reduce_inputs(np.random.default_rng(1), data)
+    seen_as = features.make_views(data, reduced)
     assert (
         seen_as.scaled.shape == (200, 4)
         and np.abs(seen_as.scaled).max() == pytest.approx(1)
@@ -303,7 +308,7 @@ def test_wide_inputs_are_seen_by_their_components(monkeypatch):
 
 
 def test_a_validation_of_wide_inputs(brief, monkeypatch):
-    monkeypatch.setattr(views, "WIDE", 50)
+    monkeypatch.setattr(features, "WIDE", 50)
     inputs = np.random.default_rng(0).normal(size=(60, 8, 9))
     result = validate(
         KEY,
@@ -319,11 +324,11 @@ def test_a_validation_of_wide_inputs(brief, monkeypatch):
 
 @pytest.mark.parametrize("reference", [20_000, 120])
 def test_neighbours_against_scikit_learn(reference, monkeypatch):
-    monkeypatch.setattr(views, "REFERENCE", reference)
-    monkeypatch.setattr(views, "ROWS", 33)
+    monkeypatch.setattr(features, "REFERENCE", reference)
+    monkeypatch.setattr(features, "ROWS", 33)
     rng = np.random.default_rng(0)
     close, labels = rng.normal(size=(200, 3)).astype(np.float32), rng.integers(0, 3, 200)
-    ours = views.difficulty_of_neighbours(np.random.default_rng(7), close, labels, 3)
+    ours = features.difficulty_of_neighbours(np.random.default_rng(7), close, labels, 3)
     chosen = (
         np.arange(200)
         if reference > 200
@@ -471,7 +476,7 @@ def test_noise_is_told_apart_by_nobody(brief):
 def test_one_value_far_out_does_not_hide_a_column(far):
     x = np.random.default_rng(0).normal(size=(300, 2))
     x[7, 0] = far
-    seen_as = views.make_views(Data(x, np.zeros(300, np.int32), 2), np.zeros((300, 0)))
+    seen_as = features.make_views(Data(x, np.zeros(300, np.int32), 2), np.zeros((300, 0)))
     assert len(np.unique(seen_as.scaled[:, 0])) == 300
     rest = np.arange(300) != 7
     assert np.corrcoef(seen_as.centred[rest, 0], x[rest, 0])[0, 1] > 0.99

@@ -12,10 +12,9 @@ import pytest
 from systems import mark_long
 
 from jast import plot
-from jast.weakness import auc, digits, encoded, from_idx, judge, load, save, thesis, validate
-from jast.weakness.contract import Seen
-from jast.weakness.data import check_data
-from jast.weakness.networks import (
+from jast._src.weakness.data import check_data
+from jast._src.weakness.features import scale_inputs
+from jast._src.weakness.networks import (
     _entropy,
     _fit,
     adversary,
@@ -26,8 +25,9 @@ from jast.weakness.networks import (
     fit_autoencoder,
     logits,
 )
-from jast.weakness.thesis import draw_halves
-from jast.weakness.views import scale_inputs
+from jast._src.weakness.selector_contract import Seen
+from jast._src.weakness.thesis_selector import draw_halves
+from jast.weakness import auc, digits, encoded, from_idx, judge, load, save, thesis, validate
 
 MNIST = Path(__file__).resolve().parents[2] / "shared" / "data" / "mnist"
 QUICK = dict(sample=120, epochs=2, encoder_epochs=2, hidden=(24, 12))

@@ -8,9 +8,9 @@ import numpy as np
 from systems import S0, ring
 
 import jast
-from jast.search.tree import layout as T
-from jast.search.tree import run
-from jast.search.tree.choice import Choice
+from jast._src.search.tree import layout as T
+from jast._src.search.tree import run
+from jast._src.search.tree.action_choice import Choice
 
 FERRY, LANDING, RING = jast.simulators.ferry(), jast.simulators.landing(b=0.3), ring()
 PLAIN = dict(reward=jast.rewards.standard(event_bonus=30.0), actions=jast.actions.samples())

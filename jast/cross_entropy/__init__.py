@@ -2,10 +2,9 @@
 surrogates and mixtures.
 """
 
-from jast._doors import dir_function
-from jast.cross_entropy import schedules
-from jast.cross_entropy.gaussian import Gaussian, normal
-from jast.cross_entropy.methods import (
+from jast._src.cross_entropy import schedules
+from jast._src.cross_entropy.gaussian import Gaussian, normal
+from jast._src.cross_entropy.methods import (
     Search,
     ask,
     ce_method,
@@ -15,10 +14,11 @@ from jast.cross_entropy.methods import (
     start,
     tell,
 )
-from jast.cross_entropy.mixture import Mixture
-from jast.cross_entropy.objectives import ackley, branin, paraboloid, sierra
-from jast.cross_entropy.result import CEResult, History, Scores, scores
-from jast.cross_entropy.stress import Stress, over
+from jast._src.cross_entropy.mixture import Mixture
+from jast._src.cross_entropy.objectives import ackley, branin, paraboloid, sierra
+from jast._src.cross_entropy.result import CEResult, History, Scores, scores
+from jast._src.cross_entropy.simulator_objective import Stress, over
+from jast._src.util.doors import dir_function
 
 __all__ = [
     "CEResult",

@@ -1,18 +1,18 @@
 """Simulated systems with a source and a known truth, one file (or folder) each; `draw` is
 a picture of a state of some of them."""
 
+from jast._src.simulators.autoregression import autoregression
+from jast._src.simulators.bluesky import bluesky, bluesky_flight
+from jast._src.simulators.colav import colav
+from jast._src.simulators.ferry import ferry
+from jast._src.simulators.fms import fms, fms_misses, fms_path
+from jast._src.simulators.landing import landing, landing_probability
+from jast._src.simulators.limit_state import limit_state
+from jast._src.simulators.pendulum import pendulum
+from jast._src.simulators.ruin import ruin, ruin_probability
+from jast._src.simulators.svg_states import draw
+from jast._src.simulators.walk import walk1d
 from jast.simulators import arch
-from jast.simulators.autoregression import autoregression
-from jast.simulators.bluesky import bluesky, bluesky_flight
-from jast.simulators.colav import colav
-from jast.simulators.drawings import draw
-from jast.simulators.ferry import ferry
-from jast.simulators.fms import fms, fms_misses, fms_path
-from jast.simulators.landing import landing, landing_probability
-from jast.simulators.limit_state import limit_state
-from jast.simulators.pendulum import pendulum
-from jast.simulators.ruin import ruin, ruin_probability
-from jast.simulators.walk import walk1d
 
 __all__ = [
     "arch",

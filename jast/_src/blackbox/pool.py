@@ -1,0 +1,279 @@
+"""Worker processes that run a system: one loky executor of one process each, so that the death or
+hang of one leaves the others alone.
+"""
+
+import pickle
+import pkgutil
+import re
+import time
+import weakref
+from collections import deque
+from concurrent.futures import FIRST_COMPLETED, wait
+from typing import NamedTuple
+
+import numpy as np
+
+from jast._src.blackbox import environment, programs, worker
+from jast._src.util.checks import import_library
+
+__all__ = ["Pool", "pack"]
+
+NEEDS = "jast.blackbox with workers >= 1"
+GRACE = 1.0  # seconds that a worker has beyond the time limits of its rows before it is killed
+START = 60.0  # seconds that a worker may take to start, and to load the system
+PIECE = 0.01  # seconds of work in a piece, at least, where that leaves no worker idle
+
+
+class Unloadable(RuntimeError):
+    """A worker process cannot load the system: nothing can be run."""
+
+
+class _Remote:
+    """A function of the module that a worker keeps its system in, by name."""
+
+    def __init__(self, name):
+        self.name = name
+
+    def __reduce__(self):
+        return pkgutil.resolve_name, (f"{worker.NAME}:{self.name}",)
+
+    def __call__(self, *args):
+        raise RuntimeError("only a worker has this function")
+
+
+class _Install:
+    """Unpickled in a worker, it is there."""
+
+    def __init__(self, system, spec):
+        self.parts = system, spec
+
+    def __reduce__(self):
+        return worker.install, self.parts
+
+
+SERVE, PROBE, CONFIGURE, JUDGE = map(_Remote, ("serve", "probe", "configure", "judge"))
+
+
+def pack(system, spec):
+    """The system as bytes; this package's part of them by value, so that a worker need not import
+    it. Raises ValueError for one that cannot be sent.
+    """
+    cloudpickle = import_library(NEEDS, "cloudpickle", "blackbox")
+    registered = cloudpickle.list_registry_pickle_by_value()
+    own = [m for m in (worker, programs, environment) if m.__name__ not in registered]
+    for module in own:
+        cloudpickle.register_pickle_by_value(module)
+    try:
+        return cloudpickle.dumps(_Install(system, spec))
+    except Exception as error:
+        raise ValueError(
+            f"from_python: system cannot be sent to a worker process: {type(error).__name__}:"
+            f" {error}; define it at the top of a module, and open files, locks and connections"
+            " inside of it, not around it"
+        ) from error
+    finally:
+        for module in own:
+            cloudpickle.unregister_pickle_by_value(module)
+
+
+class Worker:
+    """One process, started on first use and started anew after its end."""
+
+    def __init__(self, payload):
+        self.payload, self.executor = payload, None
+
+    def start(self):
+        """A future that is done when the process has the system."""
+        if self.executor is None:
+            self.executor = import_library(NEEDS, "loky", "blackbox").ProcessPoolExecutor(
+                max_workers=1, timeout=None
+            )
+            return self.executor.submit(pickle.loads, self.payload)
+
+    def submit(self, function, *args):
+        return self.executor.submit(function, *args)
+
+    def kill(self):
+        executor, self.executor = self.executor, None
+        if executor is not None:
+            executor.shutdown(wait=False, kill_workers=True)
+
+
+def _close(workers):
+    for each in workers:
+        each.kill()
+
+
+def _configure_pool(payload, workers, spec, x, size):
+    """A `Pool`."""
+    made = Pool(payload, workers, spec)
+    made.configure(x, size)
+    return made
+
+
+class _Piece(NamedTuple):
+    """Rows that a worker runs."""
+
+    worker: Worker
+    queue: deque
+    """Where the rows come from."""
+    rows: np.ndarray
+    deadline: float
+    """When they must be done, by `time.monotonic`."""
+
+
+class Pool:
+    """A `worker.Runner` whose rows are shared out over processes.
+
+    Episodes go in pieces to whoever is free; the rows of a system of kept objects stay with their
+    worker. A worker that dies, or does not answer within its rows' time limits and `GRACE`, is
+    replaced; its rows then run one by one, and the one that does it again is the culprit. So a
+    system that hangs in code that nothing can interrupt costs each row its time limit and a start
+    of a process.
+    """
+
+    def __init__(self, payload, workers, spec):
+        self.payload, self.spec = payload, spec
+        self.workers = [Worker(payload) for _ in range(workers)]
+        self.x, self.size = 0, 0
+        self.pace: float | None = None  # seconds a row
+        weakref.finalize(self, _close, self.workers)
+
+    def __reduce__(self):  # another process has workers of its own
+        return _configure_pool, (self.payload, len(self.workers), self.spec, self.x, self.size)
+
+    def configure(self, x, size):
+        """As `worker.Runner.configure`, for all workers."""
+        self.x, self.size = x, size
+        for w in self.workers:
+            if w.executor is not None:
+                w.submit(CONFIGURE, x, size)
+
+    def probe(self, x0):
+        """As `worker.Runner.probe`, in the first worker."""
+        try:
+            self._start(self.workers[:1])
+            return self.workers[0].submit(PROBE, x0).result(timeout=START)
+        except Exception as error:
+            self.workers[0].kill()
+            return _cause(error)
+
+    def judge(self, x0, xs):
+        """As `worker.Runner.judge`, in the first worker; neither of all episodes where it gives no
+        answer within their time limits.
+        """
+        n = len(xs[0])
+        limit = None if self.spec.limit is None else n * self.spec.limit + GRACE
+        self._start(self.workers[:1])
+        try:
+            return self.workers[0].submit(JUDGE, x0, xs).result(timeout=limit)
+        except Exception:
+            self.workers[0].kill()
+            return np.zeros((n, 2), bool)
+
+    def __call__(self, t, x0, xs, lanes):
+        """As `worker.Runner`: the `worker.Reply` for n rows; ``lanes`` [n]: their places in the
+        batch, which a search keeps from step to step.
+        """
+        n = len(t)
+        reply = worker.Reply(
+            *worker.blank(n, self.size), problems=[], episodes=0, transitions=0, seconds=0.0
+        )
+        queues = self._pieces(lanes)
+        free, busy = set(self.workers), {}
+        try:
+            while busy or any(queues):
+                given = [
+                    (w, queue, queue.popleft())
+                    for w, queue in zip(self.workers, queues)
+                    if w in free and queue
+                ]
+                self._start([w for w, _, _ in given])
+                for w, queue, rows in given:
+                    longest = t[rows].max()
+                    leaves = [a[rows] for a in x0], [a[rows, :longest] for a in xs]
+                    task = w.submit(SERVE, t[rows], *leaves)
+                    busy[task] = _Piece(w, queue, rows, self._deadline(t[rows]))
+                    free.remove(w)
+                first = min(piece.deadline for piece in busy.values())
+                patience = None if first == np.inf else max(0.0, first - time.monotonic())
+                done = wait(busy, patience, FIRST_COMPLETED).done
+                now = time.monotonic()
+                late = [task for task in set(busy) - done if now > busy[task].deadline]
+                for task in [*done, *late]:
+                    piece = busy.pop(task)
+                    free.add(piece.worker)
+                    limit = f"{self.spec.limit or 0:g} s"
+                    problem = "timed out", f"no answer within {limit}, and could not be interrupted"
+                    if task in done:
+                        try:
+                            reply = _merge(reply, piece.rows, worker.Reply(*task.result()))
+                            continue
+                        except Exception as error:
+                            problem = "died", _cause(error)
+                    piece.worker.kill()
+                    if len(piece.rows) > 1:  # one by one, which finds the culprit
+                        piece.queue.extendleft(piece.rows[::-1, None])
+                    else:
+                        reply.terminal[piece.rows] = True
+                        reply.problems.append((int(piece.rows[0]), *problem))
+        except BaseException:  # an interruption: what still runs must not answer the next call
+            _close(self.workers)
+            raise
+        if n:
+            self.pace = reply.seconds / n
+        return reply
+
+    def _pieces(self, lanes):
+        """A queue of row numbers for each worker; that of episodes is one for all."""
+        count, n = len(self.workers), len(lanes)
+        if not self.spec.episodic:
+            mine = [np.flatnonzero(lanes % count == i) for i in range(count)]
+            return [deque([rows] if len(rows) else []) for rows in mine]
+        rows = np.arange(n)
+        fair = -(-n // count)
+        most = fair if count == 1 or not self.pace else max(1, min(fair, int(PIECE / self.pace)))
+        size = max(1, most, -(-n // (4 * count)) if count > 1 else 0)
+        return [deque(rows[i : i + size] for i in range(0, n, size))] * count
+
+    def _deadline(self, t):
+        """When these rows must be done: each has its limit, and each transition of a history that
+        may have to be repeated.
+        """
+        if not self.spec.limit:
+            return np.inf
+        parts = len(t) if self.spec.episodic else np.sum(t + 2)
+        return time.monotonic() + float(parts) * self.spec.limit + GRACE
+
+    def _start(self, workers):
+        starting = [(w, task) for w in workers if (task := w.start()) is not None]
+        try:
+            for w, task in starting:
+                task.result(timeout=START)
+                w.submit(CONFIGURE, self.x, self.size)
+        except Exception as error:
+            _close(self.workers)
+            raise Unloadable(
+                f"a worker process could not load the system: {_cause(error)}"
+            ) from error
+
+
+def _merge(all, rows, part):
+    for name in ("event", "distance", "terminal", "log_p", "seen"):
+        getattr(all, name)[rows] = getattr(part, name)
+    all.problems.extend((int(rows[i]), kind, message) for i, kind, message in part.problems)
+    return all._replace(
+        episodes=all.episodes + part.episodes,
+        transitions=all.transitions + part.transitions,
+        seconds=all.seconds + part.seconds,
+    )
+
+
+def _cause(error):
+    """Why a worker gave no answer, in one line."""
+    if isinstance(error, Unloadable):
+        return str(error)
+    codes = re.search(r"exit codes? of the workers are \{(.*?)\}", str(error))
+    if codes:
+        return f"the process ended: {codes[1]}"
+    return f"{type(error).__name__}: {' '.join(str(error).split())[:200]}"

@@ -1,0 +1,115 @@
+"""An external program as a system: one process an episode, JSON in and out. Goes to the workers by
+value: the standard library and NumPy only.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shlex
+import shutil
+import signal
+import subprocess
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from jast._src.blackbox.worker import WrongAnswer
+
+if TYPE_CHECKING:
+    from jast._src.core.typing import PathLike
+
+__all__ = ["program"]
+
+
+class Program(NamedTuple):
+    """``(disturbances, x0=None) -> (event, distance)`` by running a command."""
+
+    command: tuple
+    folder: str | None
+
+    def __call__(self, disturbances, x0=None):
+        task = json.dumps({"x0": _plain(x0), "disturbances": _plain(disturbances)})
+        pipes = dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.PIPE)
+        # a session of its own, so that what the program has started can be ended with it
+        with subprocess.Popen(
+            self.command, **pipes, cwd=self.folder, text=True, start_new_session=True
+        ) as process:
+            try:
+                out, errors = process.communicate(task)
+            except BaseException:  # the time limit
+                _end(process)
+                raise
+        if process.returncode:
+            last = (errors.strip() or "no message on standard error").splitlines()[-1]
+            raise RuntimeError(f"{self.command[0]}: exit status {process.returncode}: {last}")
+        last = (out.strip() or " ").splitlines()[-1]
+        try:
+            answer = json.loads(last)
+            return answer["event"], answer["distance"]
+        except (ValueError, TypeError, KeyError):
+            raise WrongAnswer(
+                'the last line of standard output must be {"event": true or false, "distance":'
+                f" number}}, received {last[:80]!r}"
+            ) from None
+
+
+def program(command: str | Sequence[str], *, folder: PathLike | None = None) -> Callable[..., Any]:
+    """A system for `from_python` that runs an external program, once for each episode.
+
+    The program reads one JSON object from standard input, ``{"x0": ..., "disturbances": [...]}``
+    (the horizon's rows; lists and objects as the disturbance is; x0 is null with one start). It
+    prints ``{"event": false, "distance": 1.5}`` as the last line of its standard output. Another
+    exit status than 0, another last line, and no answer within a time limit are incidents, not
+    errors.
+
+    Args:
+        command: the program and its arguments, a list or one string (split as by a POSIX shell,
+            without one).
+        folder: where it runs.
+
+    Raises:
+        ValueError: for an empty command, and a program that is not found or is no executable file.
+
+    Example:
+        >>> import sys, jax, jast
+        >>> from jast import distributions as D
+        >>> code = '''
+        ... import json, sys
+        ... total = sum(json.load(sys.stdin)["disturbances"])
+        ... print(json.dumps({"event": total > 3.0, "distance": max(3.0 - total, 0.0)}))
+        ... '''
+        >>> run = jast.blackbox.program([sys.executable, "-c", code])
+        >>> sim = jast.blackbox.from_python(run, horizon=3, disturbance=D.Normal(0.0, 1.0))
+        >>> bool(jast.rollout(jax.random.key(0), sim).distance >= 0.0)
+        True
+    """
+    parts = tuple(shlex.split(command) if isinstance(command, str) else map(os.fspath, command))
+    if not parts:
+        raise ValueError(f"program: command must name a program, received {command!r}")
+    if folder is not None and not os.path.isdir(folder):
+        raise ValueError(f"program: folder must be a directory, received {folder!r}")
+    # a relative path with a folder in it is looked up from where the program runs
+    near = folder is not None and os.path.dirname(parts[0])
+    if shutil.which(os.path.join(folder, parts[0]) if near else parts[0]) is None:
+        raise ValueError(
+            f"program: command must name an executable program, and {parts[0]!r} was not found or"
+            " is not executable"
+        )
+    return Program(parts, None if folder is None else os.fspath(folder))
+
+
+def _end(process):
+    try:
+        os.killpg(process.pid, signal.SIGKILL)
+    except (AttributeError, OSError):  # no sessions on this system, or it has just ended
+        process.kill()
+
+
+def _plain(tree):
+    if isinstance(tree, dict):
+        return {k: _plain(v) for k, v in tree.items()}
+    if isinstance(tree, tuple | list):
+        return [_plain(v) for v in tree]
+    return None if tree is None else np.asarray(tree).tolist()

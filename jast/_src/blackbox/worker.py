@@ -1,0 +1,458 @@
+"""Runs a system, in this process or in a worker's: a row is an episode, or one transition of an
+object that is kept.
+
+This module goes to the workers by value, so that they need neither JAX nor this package: it imports
+NumPy and the standard library only.
+"""
+
+import contextlib
+import inspect
+import os
+import signal
+import sys
+import threading
+import time
+import traceback
+import types
+from typing import NamedTuple
+
+import numpy as np
+
+__all__ = [
+    "METHODS",
+    "NAME",
+    "Reply",
+    "Runner",
+    "Spec",
+    "WrongAnswer",
+    "blank",
+    "fill",
+    "history",
+    "install",
+    "line_of",
+    "takes",
+]
+
+METHODS = ("initialize", "transition", "miss_distance", "is_event")
+KEPT = 8192  # objects that are kept at most for the next transitions of their episodes
+NAME = "jast_blackbox_worker"  # the module that a worker process keeps its system in
+
+
+class WrongAnswer(Exception):
+    """The system answered something else than what was asked."""
+
+
+class NotANumber(Exception):
+    """The system answered NaN or infinity."""
+
+
+class TimedOut(BaseException):
+    """Not an Exception, so that the system's own ``except Exception`` does not stop it."""
+
+
+class Spec(NamedTuple):
+    """What a `Runner` knows beside the system."""
+
+    run: bool
+    """The system is a function of whole episodes, not a class"""
+    episodic: bool
+    horizon: int
+    x0: object
+    """The structure of x0, with the place of each leaf"""
+    random: bool
+    """x0 is given to the system"""
+    limit: float | None
+    """Seconds"""
+    tells: str | None = None
+    """What the system says of the probability of its disturbances: "log_prob" or "prob"; "maybe",
+    log p where it says a number; None: nothing that counts
+    """
+
+
+class Reply(NamedTuple):
+    """The outcome of n rows."""
+
+    event: np.ndarray
+    """[n] bool"""
+    distance: np.ndarray
+    """[n] float64; NaN where something went wrong"""
+    terminal: np.ndarray
+    """[n] bool"""
+    log_p: np.ndarray
+    """[n] float64: what the system said of the last disturbance; of the whole episode where
+    episodic; 0 where it said nothing
+    """
+    seen: np.ndarray
+    """[n, k] float64: what ``observe`` returned"""
+    problems: list
+    """(row, kind, message)"""
+    episodes: int
+    """Starts of the system"""
+    transitions: int
+    seconds: float
+
+
+def fill(structure, leaves):
+    """The tree of ``structure``, whose leaves are places in ``leaves``."""
+    if isinstance(structure, dict):
+        return {k: fill(v, leaves) for k, v in structure.items()}
+    if isinstance(structure, tuple | list):
+        parts = [fill(v, leaves) for v in structure]
+        return type(structure)(*parts) if hasattr(structure, "_fields") else type(structure)(parts)
+    return None if structure is None else leaves[structure]
+
+
+def takes(function, count):
+    """Whether ``function`` can be called with so many arguments; True where Python does not
+    know.
+    """
+    try:
+        inspect.signature(function).bind(*[None] * count)
+    except TypeError:
+        return False
+    except ValueError:
+        pass
+    return True
+
+
+def _configure_runner(system, spec, x, size):
+    made = Runner(system, spec)
+    made.configure(x, size)
+    return made
+
+
+class Runner:
+    """A system and the objects that it has made."""
+
+    def __init__(self, system, spec):
+        self.system, self.spec = system, spec
+        self.kept: dict[tuple, list] = {}  # history -> objects that have it
+        self.count = 0  # of these
+        self.spare: list = []  # objects for new episodes
+        self.x, self.size = 0, 0
+        self.episodes = self.transitions = 0
+        self.alarm = Alarm(spec.limit)
+
+    def __reduce__(self):  # another process makes objects of its own
+        return _configure_runner, (self.system, self.spec, self.x, self.size)
+
+    def configure(self, x, size):
+        """``x``: the structure of a disturbance, like ``x0`` of `Spec`; ``size``: how many numbers
+        ``observe`` returns.
+        """
+        self.x, self.size = x, size
+
+    def probe(self, x0):
+        """How many numbers ``observe`` returns, or a sentence (str) that says what is wrong with
+        the objects.
+        """
+        size = 0
+        try:
+            thing = self._fresh()
+            missing = [name for name in METHODS if not callable(getattr(thing, name, None))]
+            if missing:
+                return (
+                    f"expected an object with the methods {', '.join(METHODS)};"
+                    f" {type(thing).__name__} lacks {', '.join(missing)}"
+                )
+            if not takes(thing.initialize, int(self.spec.random)):
+                one = "x0, since start is random"
+                none = "no argument, since no start distribution was given"
+                return f"initialize must take {one if self.spec.random else none}"
+            if not takes(thing.transition, 1):
+                return "transition must take one argument, a disturbance"
+            if not self.spec.episodic and callable(getattr(thing, "observe", None)):
+                with self.alarm:
+                    self._initialize(thing, x0)
+                    size = len(_observed(thing.observe(), None))
+            self.spare.append(thing)
+        except KeyboardInterrupt:
+            raise
+        except BaseException as error:
+            return f"the first object could not be made: {_said(error)[1]}"
+        return size
+
+    def __call__(self, t, x0, xs, lanes=None):
+        """`Reply` for rows of ``t`` [n] disturbances each; ``x0``: leaves [n, ...], ``xs``: leaves
+        [n, >= t, ...].
+        """
+        n = len(t)
+        event, distance, terminal, log_p, seen = blank(n, self.size)
+        problems, begin = [], time.perf_counter()
+        self.episodes = self.transitions = 0
+        one = self._episode if self.spec.episodic else self._step
+        for i in range(n):
+            try:
+                event[i], distance[i], terminal[i], log_p[i], observed = one(
+                    int(t[i]), [np.array(a[i]) for a in x0], [np.array(a[i, : t[i]]) for a in xs]
+                )
+                if self.size:
+                    seen[i] = observed
+            except KeyboardInterrupt:
+                raise
+            except BaseException as error:  # SystemExit too: the system's, not ours
+                terminal[i] = True
+                problems.append((i, *_said(error)))
+        return Reply(
+            event=event,
+            distance=distance,
+            terminal=terminal,
+            log_p=log_p,
+            seen=seen,
+            problems=problems,
+            episodes=self.episodes,
+            transitions=self.transitions,
+            seconds=time.perf_counter() - begin,
+        )
+
+    def judge(self, x0, xs):
+        """[n, 2] bool of whole episodes of objects: whether ``is_event`` holds at a state before
+        the last, and at the last; neither where something goes wrong, as where it cannot be asked
+        before the end.
+        """
+        found = np.zeros((len(xs[0]), 2), bool)
+        for i in range(len(found)):
+            try:
+                thing = self._fresh()
+                with self.alarm:
+                    self._initialize(thing, [np.array(a[i]) for a in x0])
+                    events = [_event(thing.is_event())]
+                    for k in range(self.spec.horizon):
+                        thing.transition(fill(self.x, [np.array(a[i, k]) for a in xs]))
+                        _evaluate(thing)
+                        events.append(_event(thing.is_event()))
+            except KeyboardInterrupt:
+                raise
+            except BaseException:
+                continue
+            found[i] = any(events[:-1]), events[-1]
+            self.spare.append(thing)
+        return found
+
+    def _episode(self, t, x0, xs):
+        self.episodes += 1
+        if self.spec.run:
+            with self.alarm:
+                answer = self.system(fill(self.x, xs), *self._given(x0))
+            self.transitions += t
+            told = self.spec.tells in ("log_prob", "prob")
+            if not isinstance(answer, tuple | list) or len(answer) != 2 + told:
+                expected = ("the pair (event, distance)", "(p, event, distance)")[told]
+                raise WrongAnswer(f"expected {expected}, received {_show(answer)}")
+            log_p = self._log_p(answer[0], "p") if told else 0.0
+            return _event(answer[-2]), _distance(answer[-1]), False, log_p, None
+        thing = self._fresh()
+        with self.alarm:
+            thing.initialize(*self._given(x0))
+            log_p = 0.0
+            for k in range(t):
+                log_p += self._transition(thing, fill(self.x, [a[k] for a in xs]))
+            log_p, *outcome = self._outcome(thing, log_p, _evaluate(thing))
+        self.spare.append(thing)
+        return *outcome, False, log_p, None
+
+    def _step(self, t, x0, xs):
+        """Event, distance, terminal and observation of the object with this history, which is moved
+        on from the last one where it is kept.
+        """
+        log_p, answer = 0.0, None
+        thing, at = self._take(history(x0, xs, t - 1)) if t else None, t - 1
+        if thing is None:
+            thing, at = self._fresh(), 0
+            self.episodes += 1
+            with self.alarm:
+                answer = self._initialize(thing, x0)
+        for k in range(at, t):
+            with self.alarm:
+                log_p = self._transition(thing, fill(self.x, [a[k] for a in xs]))
+                answer = _evaluate(thing)
+        with self.alarm:
+            log_p, *outcome = self._outcome(thing, log_p, answer)
+            ended = hasattr(thing, "is_terminal") and _event(thing.is_terminal(), "is_terminal")
+            observed = _observed(thing.observe(), self.size) if self.size else None
+        if outcome[0] or ended or t >= self.spec.horizon:
+            self.spare.append(thing)
+        else:
+            self.kept.setdefault(history(x0, xs, t), []).append(thing)
+            self.count += 1
+            if self.count > KEPT:
+                self.spare.append(self._take(next(iter(self.kept))))
+        return *outcome, ended, log_p, observed
+
+    def _initialize(self, thing, x0):
+        thing.initialize(*self._given(x0))
+        return _evaluate(thing)
+
+    def _transition(self, thing, x):
+        """log p of one disturbance, by what ``transition`` returns."""
+        self.transitions += 1
+        return self._log_p(thing.transition(x), "transition")
+
+    def _outcome(self, thing, log_p, answer):
+        """log p, event and distance; ``answer``: what ``evaluate`` returned, whose (p, event,
+        distance) stand in place of the others.
+        """
+        if isinstance(answer, tuple | list) and len(answer) == 3:
+            return self._log_p(answer[0], "evaluate"), _event(answer[1]), _distance(answer[2])
+        return log_p, _event(thing.is_event()), _distance(thing.miss_distance())
+
+    def _log_p(self, value, name):
+        tells = self.spec.tells
+        if tells is None:
+            return 0.0
+        a = _array(value)
+        if a.shape != () or a.dtype.kind not in "fiu":
+            if tells == "maybe":
+                return 0.0
+            expected = "log p" if tells == "log_prob" else "p"
+            raise WrongAnswer(f"{name} must give {expected}, one number, received {_show(value)}")
+        if np.isnan(a) or a == np.inf or (tells == "prob" and a < 0):
+            raise NotANumber(f"{name} gives {a} as {'p' if tells == 'prob' else 'log p'}")
+        with np.errstate(divide="ignore"):
+            return float(np.log(a) if tells == "prob" else a)
+
+    def _given(self, x0):
+        return (fill(self.spec.x0, x0),) if self.spec.random else ()
+
+    def _fresh(self):
+        return self.spare.pop() if self.spare else self.system()
+
+    def _take(self, history):
+        things = self.kept.get(history)
+        if things is None:
+            return None
+        self.count -= 1
+        thing = things.pop()
+        if not things:
+            del self.kept[history]
+        return thing
+
+
+class Alarm(contextlib.AbstractContextManager):
+    """Raises `TimedOut` in what runs for longer than ``seconds``, where signals exist and the code
+    can be interrupted; None: never.
+    """
+
+    def __init__(self, seconds):
+        self.seconds = seconds if seconds is not None and hasattr(signal, "setitimer") else None
+        self.on = self.rang = False
+
+    def __enter__(self):
+        if self.seconds is not None:
+            signal.signal(signal.SIGALRM, self._ring)
+            self.on, self.rang = True, False
+            signal.setitimer(signal.ITIMER_REAL, self.seconds, self.seconds)
+
+    def __exit__(self, *error):
+        self.on = False  # first: a signal that is already on its way no longer raises
+        if self.seconds is not None:
+            signal.setitimer(signal.ITIMER_REAL, 0)
+            if self.rang:  # even where the system caught it
+                raise TimedOut(f"no answer within {self.seconds:g} s") from None
+
+    def _ring(self, *_):
+        if self.on:
+            self.rang = True
+            raise TimedOut
+
+
+def history(x0, xs, t):
+    """What tells episodes of ``t`` disturbances apart."""
+    return t, *(a.tobytes() for a in x0), *(a[:t].tobytes() for a in xs)
+
+
+def blank(n, size):
+    """Event, distance, terminal, log p and observation of n rows that have no answer yet."""
+    no = np.zeros(n, bool)
+    return no, np.full(n, np.nan), no.copy(), np.zeros(n), np.zeros((n, size))
+
+
+def _evaluate(thing):
+    return thing.evaluate() if hasattr(thing, "evaluate") else None
+
+
+def _event(value, name="event"):
+    a = _array(value)
+    if a.shape == () and a.dtype.kind == "f" and not np.isfinite(a):
+        raise NotANumber(f"{name} is {a}")
+    if a.shape != () or a.dtype != bool:
+        raise WrongAnswer(f"{name} must be True or False, received {_show(value)}")
+    return bool(a)
+
+
+def _distance(value):
+    a = _array(value)
+    if a.shape != () or a.dtype.kind not in "fiu":
+        raise WrongAnswer(f"distance must be one number, received {_show(value)}")
+    if not np.isfinite(a):
+        raise NotANumber(f"distance is {a}")
+    return float(a)
+
+
+def _observed(value, size):
+    a = _array(value)
+    if a.ndim != 1 or a.dtype.kind not in "fiub" or (size is not None and len(a) != size):
+        raise WrongAnswer(
+            f"observe must return a vector of {'' if size is None else f'{size} '}numbers, received"
+            f" {_show(value)}"
+        )
+    return a
+
+
+def _array(value):
+    try:
+        return np.asarray(value)
+    except ValueError:  # rows of different lengths
+        return np.array(None)
+
+
+def _show(value):
+    text = " ".join(repr(value).split())
+    return text if len(text) <= 80 else f"{type(value).__name__} {text[:70]} ..."
+
+
+def _said(error):
+    """(kind, message) of what the system raised."""
+    if isinstance(error, TimedOut):
+        return "timed out", str(error)
+    if isinstance(error, WrongAnswer):
+        return "wrong answer", str(error)
+    if isinstance(error, NotANumber):
+        return "NaN", str(error)
+    text = " ".join(str(error).split())[:200]
+    return "raised", f"raised {type(error).__name__}{f': {text}' if text else ''}{line_of(error)}"
+
+
+def line_of(error):
+    """ " (system.py:12)": the last line of the system's own code that ``error`` went through."""
+    here = os.path.join(os.path.dirname(os.path.dirname(os.path.dirname(__file__))), "")
+    frames = traceback.extract_tb(error.__traceback__)
+    frames = [f for f in frames if not f.filename.startswith(here)]
+    libraries = os.path.dirname(os.__file__), "<frozen"
+    own = [
+        f
+        for f in frames
+        if "site-packages" not in f.filename and not f.filename.startswith(libraries)
+    ] or frames
+    return f" ({os.path.basename(own[-1].filename)}:{own[-1].lineno})" if own else ""
+
+
+def install(system, spec):
+    """Keep the system in this worker process, where calls of `NAME` find it."""
+    if hasattr(signal, "SIGINT"):
+        # a search that is interrupted ends its workers itself
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_end_with, args=(os.getppid(),), daemon=True).start()
+    module = types.ModuleType(NAME)
+    module.runner = runner = Runner(system, spec)
+    # a plain tuple: the class would travel with it
+    module.serve = lambda *rows: tuple(runner(*rows))
+    module.probe, module.configure, module.judge = runner.probe, runner.configure, runner.judge
+    sys.modules[NAME] = module
+
+
+def _end_with(parent):
+    """End this process once ``parent`` has: one that was killed could not end its workers."""
+    while os.getppid() == parent:
+        time.sleep(1)
+    os._exit(1)

@@ -1,0 +1,1 @@
+"""The contract of a simulator, and what one episode of it means."""

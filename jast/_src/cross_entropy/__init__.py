@@ -1,0 +1,1 @@
+"""Cross-entropy methods for functions of a vector, with surrogates and mixtures."""

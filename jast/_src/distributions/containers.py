@@ -1,0 +1,176 @@
+"""Distributions of vectors and structures whose parts are independent."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import jax
+import jax.numpy as jnp
+
+from jast._src.distributions.base import Distribution, is_distribution, tree_map
+from jast._src.distributions.operations import mode
+from jast._src.distributions.scipy_and_numpyro import translate
+
+if TYPE_CHECKING:
+    import chex
+
+__all__ = ["Independent", "Joint", "accepted", "leaves"]
+
+
+class Independent(Distribution):
+    """The last ``reinterpreted_batch_ndims`` axes of a batch of distributions as one value.
+
+    Args:
+        distribution: of arrays, with a ``batch_shape``.
+        reinterpreted_batch_ndims: how many axes; None: all but the first.
+
+    Raises:
+        ValueError: where values are structures, or there are fewer axes than that.
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> from jast import distributions as D
+        >>> d = D.Independent(D.Normal(jnp.zeros(3), 1.0), 1)
+        >>> d.event_shape
+        (3,)
+    """
+
+    def __init__(self, distribution: Any, reinterpreted_batch_ndims: int | None = None) -> None:
+        self._distribution = distribution = _accepted(distribution)
+        event, n = distribution.event_shape, reinterpreted_batch_ndims
+        if not (isinstance(event, tuple) and all(isinstance(i, int) for i in event)):
+            raise ValueError(
+                f"Independent: distribution: expected one of arrays, received {_name(distribution)}"
+                f" with event shape {event!r}"
+            )
+        ndim = len(distribution.batch_shape)
+        n = max(ndim - 1, 0) if n is None else n
+        if not 0 <= n <= ndim:
+            raise ValueError(
+                f"Independent: reinterpreted_batch_ndims: {_name(distribution)} has {ndim} batch"
+                f" dimensions, received {n}"
+            )
+        self._reinterpreted_batch_ndims = n
+
+    @property
+    def distribution(self) -> Any:
+        return self._distribution
+
+    @property
+    def reinterpreted_batch_ndims(self) -> int:
+        return self._reinterpreted_batch_ndims
+
+    @property
+    def event_shape(self) -> Any:
+        batch = self._distribution.batch_shape
+        return (
+            batch[len(batch) - self._reinterpreted_batch_ndims :] + self._distribution.event_shape
+        )
+
+    @property
+    def batch_shape(self) -> tuple[int, ...]:
+        batch = self._distribution.batch_shape
+        return batch[: len(batch) - self._reinterpreted_batch_ndims]
+
+    def _sample_n(self, key: chex.PRNGKey, n: int) -> Any:
+        return self._distribution.sample(seed=key, sample_shape=n)
+
+    def log_prob(self, value: Any) -> chex.Array:
+        log_p = self._distribution.log_prob(value)
+        return jnp.sum(log_p, axis=tuple(-i - 1 for i in range(self._reinterpreted_batch_ndims)))
+
+    def mean(self) -> Any:
+        return self._distribution.mean()
+
+    def variance(self) -> Any:
+        return self._distribution.variance()
+
+    def stddev(self) -> Any:
+        return self._distribution.stddev()
+
+    def median(self) -> Any:
+        return self._distribution.median()
+
+    def mode(self) -> Any:
+        return mode(self._distribution)
+
+
+class Joint(Distribution):
+    """A structure (dict, tuple, NamedTuple, ...) of independent distributions of one batch shape:
+    values are structures alike.
+
+    Raises:
+        ValueError: where a leaf is no distribution, or the batch shapes differ.
+
+    Example:
+        >>> from jast import distributions as D
+        >>> d = D.Joint({"gust": D.Normal(0.0, 1.0), "late": D.Bernoulli(probs=0.1)})
+        >>> sorted(d.sample(seed=0))
+        ['gust', 'late']
+    """
+
+    def __init__(self, distributions: Any) -> None:
+        self._distributions = tree_map(_accepted, distributions)
+        batches = {d.batch_shape for d in leaves(self._distributions)}
+        if len(batches) > 1:
+            each = ", ".join(f"{_name(d)} {d.batch_shape}" for d in leaves(self._distributions))
+            raise ValueError(f"Joint: expected one batch shape, received {each}")
+
+    @property
+    def distributions(self) -> Any:
+        return self._distributions
+
+    @property
+    def event_shape(self) -> Any:
+        return tree_map(lambda d: d.event_shape, self._distributions)
+
+    @property
+    def batch_shape(self) -> tuple[int, ...]:
+        return leaves(self._distributions)[0].batch_shape
+
+    @property
+    def dtype(self) -> Any:
+        return tree_map(lambda d: d.dtype, self._distributions)
+
+    def _sample_n(self, key: chex.PRNGKey, n: int) -> Any:
+        treedef = jax.tree.structure(self._distributions, is_leaf=is_distribution)
+        keys = treedef.unflatten(list(jax.random.split(key, treedef.num_leaves)))
+        return tree_map(lambda d, k: d.sample(seed=k, sample_shape=n), self._distributions, keys)
+
+    def log_prob(self, value: Any) -> chex.Array:
+        parts = tree_map(lambda d, v: d.log_prob(v), self._distributions, value)
+        return jnp.sum(jnp.stack(jax.tree.leaves(parts)), axis=0)
+
+    def mean(self) -> Any:
+        return tree_map(lambda d: d.mean(), self._distributions)
+
+    def median(self) -> Any:
+        return tree_map(lambda d: d.median(), self._distributions)
+
+    def mode(self) -> Any:
+        return tree_map(mode, self._distributions)
+
+
+def leaves(distributions: Any) -> list[Any]:
+    """The distributions of a structure of them."""
+    return jax.tree.leaves(distributions, is_leaf=is_distribution)
+
+
+def accepted(d: Any) -> Any:
+    """``d``, one of scipy.stats or of NumPyro as jast has it."""
+    return d if isinstance(d, Distribution) else translate(d, Independent)
+
+
+def _accepted(d: Any) -> Any:
+    """The same, one of tensorflow-probability as distrax sees it."""
+    if isinstance(d := accepted(d), Distribution):
+        return d
+    if type(d).__module__.partition(".")[0] != "tensorflow_probability":
+        raise ValueError(f"expected a distribution, received {d!r}")
+    from jast._src.distributions.distrax_loader import distrax
+
+    return distrax.as_distribution(d)
+
+
+def _name(d: Any) -> str:
+    return type(d).__name__

@@ -1,0 +1,237 @@
+"""Families of counts: geometric, Poisson, binomial. Their numbers are found by the logs of the
+probabilities below and above, so that rare ones come at the right z in both tails.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import jax
+import jax.numpy as jnp
+from jax.lax import lgamma
+from jax.scipy.special import betainc, gammainc, gammaincc
+
+from jast._src.distributions.base import Elementwise, float_array
+from jast._src.distributions.family_table import register
+from jast._src.distributions.normal_tails import (
+    inside,
+    log_one_less,
+    log_tails,
+    normal_of_log_tails,
+)
+from jast._src.distributions.tilted import Tilted
+
+if TYPE_CHECKING:
+    import chex
+
+__all__ = ["Binomial", "Geometric", "Poisson", "TiltedCounts"]
+
+
+class _Counts(Elementwise):
+    """0, 1, 2, ... by one parameter; a subclass says ``log_tails(k)`` and ``top``."""
+
+    _parameters = ("_parameter",)
+    _parameter: Any
+
+    @property
+    def dtype(self) -> Any:
+        return jnp.zeros((), int).dtype
+
+    def log_tails(self, k: int) -> tuple[chex.Array, chex.Array]:
+        """(log P(X <= k), log P(X > k)) for whole k >= -1, as floats."""
+        raise NotImplementedError
+
+    def _place(self, below, above):
+        """The least k with P(X <= k) >= exp(below), by whichever of the two is small."""
+
+        def halve(i, bounds):
+            low, high = bounds  # P(X <= low) is too little, P(X <= high) is enough
+            middle = jnp.floor((low + high) / 2)
+            log_below, log_above = self.log_tails(middle)
+            enough = jnp.where(below < above, log_below >= below, log_above <= above)
+            return jnp.where(enough, low, middle), jnp.where(enough, middle, high)
+
+        top = jnp.broadcast_to(self.top, jnp.shape(below)).astype(below.dtype)
+        low, high = jax.lax.fori_loop(0, 32, halve, (jnp.full_like(top, -1), top))
+        return high.astype(self.dtype)
+
+    def log_cell(self, x: Any) -> chex.Array:
+        """(log of P(X < x) + p(x) / 2, log of P(X > x) + p(x) / 2): the middle of x's cell."""
+        k = jnp.floor(jnp.asarray(x).astype(self._parameter.dtype))
+        half = self._log_p(jnp.maximum(k, 0)) - jnp.log(2.0).astype(k.dtype)
+        half = jnp.where(k < 0, -jnp.inf, half)
+        below = self.log_tails(jnp.maximum(k - 1, -1))[0]
+        above = self.log_tails(jnp.maximum(k, -1))[1]
+        return jnp.logaddexp(below, half), jnp.logaddexp(above, half)
+
+    def log_prob(self, value: Any) -> chex.Array:
+        k = jnp.asarray(value).astype(self._parameter.dtype)
+        whole = (k >= 0) & (k == jnp.floor(k))
+        return jnp.where(whole, self._log_p(jnp.where(whole, k, 0)), -jnp.inf)
+
+
+class Geometric(_Counts):
+    """How many failures come before the first success, of probability ``probs``: 0, 1, 2, ...
+
+    Example:
+        >>> from jast import distributions as D
+        >>> d = D.Geometric(0.5)
+        >>> int(d.mode())
+        0
+    """
+
+    def __init__(self, probs: chex.Numeric) -> None:
+        self.probs: jax.Array = float_array(probs)
+        self._parameter = self.probs
+
+    def _sample_n(self, key: chex.PRNGKey, n: int) -> Any:
+        u = jax.random.uniform(key, (n, *self.batch_shape), self.probs.dtype)
+        return self._place(None, jnp.log1p(-u))
+
+    def _place(self, below, above):
+        k = jnp.ceil(above / jnp.log1p(-self.probs)) - 1
+        return jnp.maximum(k, 0).astype(self.dtype)
+
+    def _log_p(self, k):
+        return jnp.log(self.probs) + k * jnp.log1p(-self.probs)
+
+    def log_tails(self, k: int) -> tuple[chex.Array, chex.Array]:
+        above = (k + 1) * jnp.log1p(-self.probs)
+        return log_one_less(above), above
+
+    def mean(self) -> Any:
+        return (1 - self.probs) / self.probs
+
+    def mode(self) -> Any:
+        return jnp.zeros(self.batch_shape, self.dtype)
+
+
+class Poisson(_Counts):
+    """Of mean ``rate``.
+
+    Example:
+        >>> from jast import distributions as D
+        >>> d = D.Poisson(3.5)
+        >>> int(d.mode())
+        3
+    """
+
+    def __init__(self, rate: chex.Numeric) -> None:
+        self.rate: jax.Array = float_array(rate)
+        self._parameter = self.rate
+
+    @property
+    def top(self) -> Any:
+        return jnp.ceil(self.rate + 40 * jnp.sqrt(self.rate) + 800)  # beyond every float's z
+
+    def _sample_n(self, key: chex.PRNGKey, n: int) -> Any:
+        return jax.random.poisson(key, self.rate, (n, *self.batch_shape), self.dtype)
+
+    def _log_p(self, k):
+        return k * jnp.log(self.rate) - self.rate - lgamma(k + 1)
+
+    def log_tails(self, k: int) -> tuple[chex.Array, chex.Array]:
+        return jnp.log(gammaincc(k + 1, self.rate)), jnp.log(gammainc(k + 1, self.rate))
+
+    def mean(self) -> Any:
+        return self.rate
+
+    def mode(self) -> Any:
+        return jnp.floor(self.rate).astype(self.dtype)
+
+
+class Binomial(_Counts):
+    """How many of ``total_count`` trials succeed, each with probability ``probs``.
+
+    Example:
+        >>> from jast import distributions as D
+        >>> d = D.Binomial(10.0, 0.5)
+        >>> int(d.mode())
+        5
+    """
+
+    _parameters = "total_count", "probs"
+
+    def __init__(self, total_count: chex.Numeric, probs: chex.Numeric) -> None:
+        self.probs: jax.Array = float_array(probs)
+        self.total_count: jax.Array = jnp.asarray(total_count, self.probs.dtype)
+        self._parameter = self.probs
+
+    @property
+    def top(self) -> Any:
+        return self.total_count
+
+    def _sample_n(self, key: chex.PRNGKey, n: int) -> Any:
+        shape = (n, *self.batch_shape)
+        x = jax.random.binomial(key, self.total_count, self.probs, shape, self.probs.dtype)
+        return x.astype(self.dtype)
+
+    def _log_p(self, k):
+        n, p = self.total_count, self.probs
+        inner = jnp.minimum(k, n)
+        ways = lgamma(n + 1) - lgamma(inner + 1) - lgamma(n - inner + 1)
+        log_p = ways + inner * jnp.log(p) + (n - inner) * jnp.log1p(-p)
+        return jnp.where(k > n, -jnp.inf, log_p)
+
+    def log_tails(self, k: int) -> tuple[chex.Array, chex.Array]:
+        n, p = self.total_count, self.probs
+        inner = jnp.clip(k, 0, n - 1)
+        below = jnp.log(betainc(n - inner, inner + 1, 1 - p))
+        above = jnp.log(betainc(inner + 1, n - inner, p))
+        none, all_of = k < 0, k >= n
+        return (
+            jnp.where(none, -jnp.inf, jnp.where(all_of, 0.0, below)),
+            jnp.where(none, 0.0, jnp.where(all_of, -jnp.inf, above)),
+        )
+
+    def mean(self) -> Any:
+        return self.total_count * self.probs
+
+    def mode(self) -> Any:
+        k = jnp.floor((self.total_count + 1) * self.probs)
+        return jnp.minimum(k, self.total_count).astype(self.dtype)
+
+
+class TiltedCounts(Tilted):
+    """A family of counts with z ~ N(mean, deviation^2): only the probabilities of its numbers
+    change. Exact.
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> from jast import distributions as D
+        >>> d = D.tilted(D.Poisson(3.0), jnp.array(2.0), jnp.array(0.5))
+        >>> int(d.sample(seed=0)) > 1
+        True
+    """
+
+    @property
+    def dtype(self) -> Any:
+        return self._distribution.dtype
+
+    def _edge(self, k):
+        """The z above which numbers are greater than k."""
+        below, above = self._distribution.log_tails(k)
+        z = normal_of_log_tails(below, above)
+        return jnp.where(jnp.isinf(below), -jnp.inf, jnp.where(jnp.isinf(above), jnp.inf, z))
+
+    def log_prob(self, value: Any) -> chex.Array:
+        k = jnp.asarray(value).astype(self._mean.dtype)
+        edges = (self._edge(v) for v in (jnp.maximum(k - 1, -1), k))
+        a, b = ((v - self._mean) / self._deviation for v in edges)
+        # in the upper tail from the other side, where the numbers are small
+        near, far = jnp.where(a > 0, -a, b), jnp.where(a > 0, -b, a)
+        log_near, log_far = log_tails(near)[0], log_tails(far)[0]
+        some = (k >= 0) & (k == jnp.floor(k)) & (log_near > -jnp.inf)
+        gap = jnp.where(some, log_far - log_near, -1)
+        return jnp.where(some, log_near + log_one_less(jnp.minimum(gap, 0)), -jnp.inf)
+
+
+for _kind in (Geometric, Poisson, Binomial):
+    register(
+        _kind,
+        quantile=lambda d, u: d._place(jnp.log(inside(u)), jnp.log1p(-inside(u))),
+        cdf=lambda d, x: jnp.exp(d.log_cell(x)[0]),
+        from_normal=lambda d, z: d._place(*log_tails(z)),
+        to_normal=lambda d, x: normal_of_log_tails(*d.log_cell(x)),
+        tilt=TiltedCounts,
+    )

@@ -1,0 +1,126 @@
+"""The rows of the normal family, of the containers and of one of two classes; those of other
+families are in `rows`. Each serves distrax's class of that name, too.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax.numpy as jnp
+from jax.scipy.linalg import solve_triangular
+
+from jast._src.distributions import containers, normal, operations, special
+from jast._src.distributions.base import tree_map
+from jast._src.distributions.family_table import register
+from jast._src.distributions.normal_tails import inside, ndtr, ndtri, standard
+from jast._src.distributions.tilted import tilted
+
+__all__ = ["register_both"]
+
+
+def register_both(kind: type, **functions: Callable[..., Any]) -> None:
+    """One row for jast's class ``kind`` and for distrax's of the same name."""
+    register(kind, **functions)
+    register(f"distrax:{kind.__name__}", **functions)
+
+
+register_both(
+    normal.Normal,
+    quantile=lambda d, u: d.loc + d.scale * ndtri(inside(u)),
+    cdf=lambda d, x: ndtr(standard(x - d.loc, d.scale)),
+    from_normal=lambda d, z: d.loc + d.scale * z,
+    to_normal=lambda d, x: (x - d.loc) / d.scale,
+    tilt=lambda d, m, s: normal.Normal(d.loc + d.scale * m, d.scale * s),
+)
+
+register_both(
+    normal.MultivariateNormalDiag,
+    quantile=lambda d, u: d.loc + d.scale_diag * ndtri(inside(u)),
+    cdf=lambda d, x: ndtr(standard(x - d.loc, d.scale_diag)),
+    from_normal=lambda d, z: d.loc + d.scale_diag * z,
+    to_normal=lambda d, x: (x - d.loc) / d.scale_diag,
+    tilt=lambda d, m, s: normal.MultivariateNormalDiag(d.loc + d.scale_diag * m, d.scale_diag * s),
+)
+
+
+def _cdf_tri(d, x):
+    far = jnp.sqrt(jnp.finfo(d.loc.dtype).max)  # an infinite one would make others NaN
+    return ndtr(solve_triangular(d.scale_tri, jnp.clip(x - d.loc, -far, far), lower=d.is_lower))
+
+
+register_both(
+    normal.MultivariateNormalTri,
+    quantile=lambda d, u: d.loc + d.scale_tri @ ndtri(inside(u)),
+    cdf=_cdf_tri,
+    from_normal=lambda d, z: d.loc + d.scale_tri @ z,
+    to_normal=lambda d, x: solve_triangular(d.scale_tri, x - d.loc, lower=d.is_lower),
+    tilt=lambda d, m, s: normal.MultivariateNormalTri(
+        d.loc + d.scale_tri @ m, d.scale_tri * s[None, :], is_lower=d.is_lower
+    ),
+)
+
+
+# the containers
+
+
+def _summed(d, x):
+    inner = operations.log_density(d.distribution, x, "mode")
+    return inner.sum(range(inner.ndim - d.reinterpreted_batch_ndims, inner.ndim))
+
+
+register_both(
+    containers.Independent,
+    quantile=lambda d, u: operations.quantile(d.distribution, u),
+    cdf=lambda d, x: operations.cdf(d.distribution, x),
+    from_normal=lambda d, z: operations.from_normal(d.distribution, z),
+    to_normal=lambda d, x: operations.to_normal(d.distribution, x),
+    mode=lambda d: operations.mode(d.distribution),
+    log_prob_from_mode=_summed,
+    tilt=lambda d, m, s: containers.Independent(
+        tilted(d.distribution, m, s), d.reinterpreted_batch_ndims
+    ),
+    exact=lambda d: operations.has_exact_tails(d.distribution),
+)
+
+
+def _each(verb: Callable[..., Any]) -> Callable[..., Any]:
+    return lambda d, *values: tree_map(verb, d.distributions, *values)
+
+
+register_both(
+    containers.Joint,
+    quantile=_each(operations.quantile),
+    cdf=_each(operations.cdf),
+    from_normal=_each(operations.from_normal),
+    to_normal=_each(operations.to_normal),
+    mode=_each(operations.mode),
+    log_mode=lambda d: operations.sum_parts(_each(operations.log_mode)(d)),
+    log_prob_from_mode=lambda d, x: operations.sum_parts(
+        tree_map(lambda e, v: operations.log_density(e, v, "mode"), d.distributions, x)
+    ),
+    tilt=lambda d, m, s: containers.Joint(tree_map(tilted, d.distributions, m, s)),
+    exact=lambda d: all(operations.has_exact_tails(e) for e in containers.leaves(d.distributions)),
+)
+
+
+def _either(verb: Callable[..., Any]) -> Callable[..., Any]:
+    return lambda d, x: d.select(*(verb(part, x) for part in d.parts))
+
+
+register(
+    special.Where,
+    quantile=_either(operations.quantile),
+    cdf=_either(operations.cdf),
+    from_normal=_either(operations.from_normal),
+    to_normal=_either(operations.to_normal),
+    tilt=lambda d, m, s: special.Where(d.pred, *(tilted(part, m, s) for part in d.parts)),
+    exact=lambda d: all(operations.has_exact_tails(part) for part in d.parts),
+)
+
+register(
+    special.Fixed,
+    quantile=lambda d, u: (),
+    cdf=lambda d, x: (),
+    from_normal=lambda d, z: (),
+    to_normal=lambda d, x: (),
+    tilt=lambda d, m, s: d,
+)

@@ -1,0 +1,278 @@
+"""Skewed families with closed quantiles, exact in both tails: each a class and one row, by the logs
+of the probabilities below and above a value.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import jax
+import jax.numpy as jnp
+
+from jast._src.distributions.base import Elementwise, float_array
+from jast._src.distributions.family_table import register
+from jast._src.distributions.log_tail_rows import of_log_tails
+from jast._src.distributions.normal import LocationScale
+from jast._src.distributions.normal_tails import (
+    HALF_LOG_2PI,
+    inside,
+    log_one_less,
+    log_tails,
+    ndtr,
+    ndtri,
+    normal_of_log_tails,
+)
+
+if TYPE_CHECKING:
+    import chex
+
+__all__ = ["Exponential", "Gumbel", "LogNormal", "TruncatedNormal", "Weibull"]
+
+
+class LogNormal(LocationScale):
+    """exp(e), e normal with mean ``loc`` and standard deviation ``scale``.
+
+    Example:
+        >>> from jast import distributions as D
+        >>> d = D.LogNormal(0.0, 1.0)
+        >>> float(d.median())
+        1.0
+    """
+
+    def _sample_n(self, key: chex.PRNGKey, n: int) -> Any:
+        return jnp.exp(self._placed(jax.random.normal(key, **self._like_n(n))))
+
+    def log_prob(self, value: Any) -> chex.Array:
+        log = jnp.log(value)
+        return -0.5 * jnp.square(self._standardize(log)) - HALF_LOG_2PI - jnp.log(self._scale) - log
+
+    def mean(self) -> Any:
+        return jnp.exp(self.loc + jnp.square(self.scale) / 2)
+
+    def median(self) -> Any:
+        return jnp.exp(self.loc)
+
+    def mode(self) -> Any:
+        return jnp.exp(self.loc - jnp.square(self.scale))
+
+
+register(
+    LogNormal,
+    quantile=lambda d, u: jnp.exp(d.loc + d.scale * ndtri(inside(u))),
+    cdf=lambda d, x: ndtr((jnp.log(x) - d.loc) / d.scale),
+    from_normal=lambda d, z: jnp.exp(d.loc + d.scale * z),
+    to_normal=lambda d, x: (jnp.log(x) - d.loc) / d.scale,
+    tilt=lambda d, m, s: LogNormal(d.loc + d.scale * m, d.scale * s),
+)
+
+
+class Exponential(Elementwise):
+    """Density rate exp(-rate x), x >= 0.
+
+    Example:
+        >>> from jast import distributions as D
+        >>> d = D.Exponential(2.0)
+        >>> float(d.mean())
+        0.5
+    """
+
+    _parameters = ("rate",)
+
+    def __init__(self, rate: chex.Numeric) -> None:
+        self.rate: jax.Array = float_array(rate)
+
+    def _sample_n(self, key: chex.PRNGKey, n: int) -> Any:
+        return jax.random.exponential(key, (n, *self.rate.shape), self.rate.dtype) / self.rate[None]
+
+    def log_prob(self, value: Any) -> chex.Array:
+        return jnp.where(value < 0, -jnp.inf, jnp.log(self.rate) - self.rate * value)
+
+    def mean(self) -> Any:
+        return 1 / self.rate
+
+    def mode(self) -> Any:
+        return jnp.zeros_like(self.rate)
+
+
+def _tails_exponential(d, x):
+    above = -d.rate * jnp.maximum(x, 0)
+    return log_one_less(above), above
+
+
+register(Exponential, **of_log_tails(lambda d, below, above: -above / d.rate, _tails_exponential))
+
+
+class Gumbel(LocationScale):
+    """Of the largest of many numbers: distribution function exp(-exp(-(x - loc) / scale)).
+
+    Example:
+        >>> from jast import distributions as D
+        >>> d = D.Gumbel(1.0, 2.0)
+        >>> float(d.mode())
+        1.0
+    """
+
+    def _sample_n(self, key: chex.PRNGKey, n: int) -> Any:
+        return self._placed(jax.random.gumbel(key, **self._like_n(n)))
+
+    def log_prob(self, value: Any) -> chex.Array:
+        v = self._standardize(value)
+        return -(v + jnp.exp(-v)) - jnp.log(self._scale)
+
+    def mean(self) -> Any:
+        return self.loc + self.scale * jnp.euler_gamma
+
+    def mode(self) -> Any:
+        return self.loc
+
+
+def _tails_gumbel(d, x):
+    below = -jnp.exp(-(x - d.loc) / d.scale)
+    return below, log_one_less(below)
+
+
+for _kind in (Gumbel, "distrax:Gumbel"):
+    register(
+        _kind,
+        **of_log_tails(lambda d, below, above: d.loc - d.scale * jnp.log(-below), _tails_gumbel),
+    )
+
+
+class Weibull(Elementwise):
+    """Survival function exp(-(x / scale)^concentration), x >= 0.
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> from jast import distributions as D
+        >>> d = D.Weibull(1.0, 2.0)
+        >>> round(float(D.cdf(d, jnp.array(2.0))), 3)  # 1 - 1 / e
+        0.632
+    """
+
+    _parameters = "_shape", "_scale"
+
+    def __init__(self, concentration: chex.Numeric, scale: chex.Numeric) -> None:
+        self._shape, self._scale = float_array(concentration), float_array(scale)
+
+    @property
+    def concentration(self) -> jax.Array:
+        return self._broadcast(self._shape)
+
+    @property
+    def scale(self) -> jax.Array:
+        return self._broadcast(self._scale)
+
+    def _sample_n(self, key: chex.PRNGKey, n: int) -> Any:
+        k, scale = self.concentration, self.scale
+        e = jax.random.exponential(key, (n, *k.shape), jnp.result_type(k, scale))
+        return scale[None] * e ** (1 / k[None])
+
+    def log_prob(self, value: Any) -> chex.Array:
+        k, v = self._shape, value / self._scale
+        inner = jnp.log(k / self._scale) + (k - 1) * jnp.log(jnp.abs(v)) - jnp.abs(v) ** k
+        return jnp.where(v < 0, -jnp.inf, inner)
+
+    def mode(self) -> Any:
+        k = self.concentration
+        return self.scale * jnp.where(k > 1, jnp.maximum(1 - 1 / k, 0) ** (1 / k), 0.0)
+
+
+def _tails_weibull(d, x):
+    above = -((jnp.maximum(x, 0) / d.scale) ** d.concentration)
+    return log_one_less(above), above
+
+
+register(
+    Weibull,
+    **of_log_tails(
+        lambda d, below, above: d.scale * (-above) ** (1 / d.concentration), _tails_weibull
+    ),
+)
+
+
+class TruncatedNormal(LocationScale):
+    """Normal numbers (``loc``, ``scale`` before the cut) between ``low`` and ``high``, of which
+    either may be infinite.
+
+    Example:
+        >>> from jast import distributions as D
+        >>> d = D.TruncatedNormal(0.0, 1.0, 0.5, 2.0)
+        >>> 0.5 <= float(d.sample(seed=0)) <= 2.0
+        True
+    """
+
+    _parameters = "_loc", "_scale", "_low", "_high"
+
+    def __init__(
+        self, loc: chex.Numeric, scale: chex.Numeric, low: chex.ArrayTree, high: chex.ArrayTree
+    ) -> None:
+        super().__init__(loc, scale)
+        self._low, self._high = float_array(low), float_array(high)
+
+    @property
+    def low(self) -> jax.Array:
+        return self._broadcast(self._low)
+
+    @property
+    def high(self) -> jax.Array:
+        return self._broadcast(self._high)
+
+    def ends(self) -> tuple[jax.Array, jax.Array, jax.Array]:
+        """(low, high) in standard deviations from loc, and the log of the mass between them."""
+        a, b = ((v - self.loc) / self.scale for v in (self.low, self.high))
+        # where both are above loc by their upper tails, where the numbers are small
+        near, far = jnp.where(a > 0, -a, b), jnp.where(a > 0, -b, a)
+        below, above = log_tails(near)[0], log_tails(far)[0]
+        return a, b, below + log_one_less(jnp.minimum(above - below, 0))
+
+    def _sample_n(self, key: chex.PRNGKey, n: int) -> Any:
+        z = jax.random.normal(key, **self._like_n(n))
+        return jax.vmap(lambda z: _cut(self, z))(z)
+
+    def log_prob(self, value: Any) -> chex.Array:
+        exponent = -0.5 * jnp.square(self._standardize(value))
+        log_p = exponent - HALF_LOG_2PI - jnp.log(self._scale) - self.ends()[2]
+        return jnp.where((value < self._low) | (value > self._high), -jnp.inf, log_p)
+
+    def mode(self) -> Any:
+        return jnp.clip(self.loc, self.low, self.high)
+
+
+def _cut(d, z, tails=None):
+    a, b, log_mass = d.ends()
+    below, above = log_tails(z) if tails is None else tails
+    e = normal_of_log_tails(
+        jnp.logaddexp(log_tails(a)[0], log_mass + below),
+        jnp.logaddexp(log_tails(b)[1], log_mass + above),
+    )
+    x = jnp.clip(d.loc + d.scale * e, d.low, d.high)
+
+    def from_end(end, log_part):
+        """The way from an end, |z| = ``end`` towards the mean, with a small part of the mass: what
+        the sum above rounds away. By the series of the inverse.
+        """
+        finite = jnp.isfinite(end)
+        end = jnp.where(finite, end, 0)
+        h = jnp.exp(jnp.minimum(log_mass + log_part + end**2 / 2 + HALF_LOG_2PI, 0))
+        small = finite & (h * (1 + jnp.abs(end)) < 1e-3)
+        h = jnp.where(small, h, 0)
+        return small, d.scale * h * (1 + end * h / 2 + (2 * end**2 + 1) * h**2 / 6)
+
+    at_low, step = from_end(a, below)
+    x = jnp.where(at_low, d.low + step, x)
+    at_high, step = from_end(-b, above)
+    return jnp.where(at_high, d.high - step, x)
+
+
+def _tails_cut(d, x):
+    a, b, log_mass = d.ends()
+    e = (jnp.clip(x, d.low, d.high) - d.loc) / d.scale
+    left = TruncatedNormal(0.0, 1.0, a, e).ends()[2]
+    right = TruncatedNormal(0.0, 1.0, e, b).ends()[2]
+    return left - log_mass, right - log_mass
+
+
+register(
+    TruncatedNormal,
+    **of_log_tails(lambda d, below, above: _cut(d, None, (below, above)), _tails_cut),
+)

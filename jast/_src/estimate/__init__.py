@@ -1,0 +1,1 @@
+"""Failure probabilities: populations, importance sampling, subset simulation, counts."""

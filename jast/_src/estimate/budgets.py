@@ -1,0 +1,99 @@
+"""How many evaluations a call is given, by what they cost: the rate of a system is measured, and
+the budget that follows from it is named, so that the same call can be made again.
+"""
+
+import math
+import time
+from typing import Any
+
+import jax
+import numpy as np
+
+from jast._src.core.counter_prng import numpy_generator
+from jast._src.core.simulator import Simulator
+from jast._src.estimate.population.population import episodes_a_second
+from jast._src.normal_space import transform as latent
+from jast._src.normal_space.evaluate_points import judged
+from jast._src.runtime.host_errors import runs_on_host
+
+__all__ = [
+    "DEFAULT_BUDGET",
+    "MIN_POPULATION_BUDGET",
+    "check_budget_or_seconds",
+    "measure_budget",
+    "uses_populations",
+]
+
+DEFAULT_SECONDS = 8.0
+"""CPU seconds of simulation that a call takes by default; the rest of ten is compilation."""
+MIN_POPULATION_BUDGET = 300_000
+"""Evaluations from which populations answer sooner than a proposal that is found with few."""
+MAX_DEFAULT_BUDGET = 2**25
+"""Evaluations by default at most: static problems of few numbers are then answered within 3 % down
+to 1e-9, in seconds."""
+DEFAULT_BUDGET = 100_000
+"""Evaluations by default of a system that does not simulate `MIN_POPULATION_BUDGET` in
+`DEFAULT_SECONDS`."""
+TIMED_SECONDS = 0.2
+"""Seconds of the runs by which the rate of a black box is measured."""
+MAX_TIMED_RUNS = 1024
+"""Runs of them at most."""
+
+
+def uses_populations(sim: Simulator, budget: int) -> bool:
+    """Whether so many evaluations of a system are spent by populations."""
+    return budget >= MIN_POPULATION_BUDGET and not runs_on_host(sim)
+
+
+def measure_budget(
+    name: str,
+    key: jax.Array,
+    sim: Simulator,
+    seconds: float | None,
+    least: int,
+    default: int = DEFAULT_BUDGET,
+) -> int:
+    """Evaluations for the ``seconds`` of a call (None: as many as a cheap system simulates in
+    `DEFAULT_SECONDS`, ``default`` of others), at least ``least``.
+
+    They are 2^k or 3 2^k, so that two calls on one machine mostly agree.
+
+    Raises:
+        ValueError: for ``seconds`` that are not a number above 0.
+    """
+    if seconds is None:
+        if runs_on_host(sim):
+            return default
+        budget = _round_down(DEFAULT_SECONDS * episodes_a_second(key, sim))
+        return default if budget < MIN_POPULATION_BUDGET else min(budget, MAX_DEFAULT_BUDGET)
+    real = isinstance(seconds, int | float | np.number) and not isinstance(seconds, bool)
+    if not real or not 0 < float(seconds) < math.inf:
+        raise ValueError(f"{name}: seconds must be a number above 0, received {seconds!r}")
+    rate = _episodes_a_second_on_host if runs_on_host(sim) else episodes_a_second
+    return max(_round_down(float(seconds) * rate(key, sim)), least)
+
+
+def check_budget_or_seconds(name: str, budget: Any, seconds: Any) -> None:
+    """ValueError where both are given."""
+    if budget is not None and seconds is not None:
+        raise ValueError(
+            f"{name}: give budget or seconds, received budget={budget!r} and seconds={seconds!r}"
+        )
+
+
+def _round_down(evaluations: float) -> int:
+    power = 2 ** int(math.log2(max(evaluations, 2)))
+    return power * 3 // 2 if evaluations >= 1.5 * power else power
+
+
+def _episodes_a_second_on_host(key: jax.Array, sim: Simulator) -> float:
+    """Episodes a second of a system that is not in JAX, by as many as take a fifth of one."""
+    n, rng = 1, numpy_generator(key, 6)
+    while True:
+        z = rng.standard_normal((n, latent.dimension(sim))).astype(latent.normal_numbers(sim))
+        begun = time.perf_counter()
+        judged(sim, z)
+        spent = time.perf_counter() - begun
+        if spent > TIMED_SECONDS or n >= MAX_TIMED_RUNS:
+            return n / max(spent, 1e-9)
+        n *= 4

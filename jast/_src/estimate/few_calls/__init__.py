@@ -1,0 +1,1 @@
+"""Estimates from few runs, by a surrogate that learns where it is unsure."""

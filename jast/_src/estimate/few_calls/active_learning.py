@@ -1,0 +1,188 @@
+"""A surrogate of a slow system learns where a call says most.
+
+As AK-MCS (Echard, Gayton and Lemaire 2011) with other parts: failures are data without a value
+(`estimate.few_calls.surrogate`), candidates are drawn around what the surrogate holds for possible
+(`estimate.few_calls.surrogate_pool`), and a batch is chosen that leaves the least doubt about
+failure at these. A quarter of each batch looks where nobody has looked.
+"""
+
+import math
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from jast._src.core.counter_prng import numpy_generator
+from jast._src.core.simulator import Simulator
+from jast._src.estimate.few_calls.surrogate import (
+    Surrogate,
+    covariance,
+    fit,
+    predict,
+    probability_below_zero,
+)
+from jast._src.estimate.few_calls.surrogate_pool import DOUBT, Pool, expected, pool
+from jast._src.normal_space import transform as latent
+from jast._src.runtime.checkpoints import answer_once
+from jast._src.runtime.progress_bar import Watch
+
+__all__ = ["CANDIDATES", "Learner", "choose_calls"]
+
+LEARNING = 0.65  # share of the budget for learning
+CALLS = 240  # of learning, at most
+HELD = 400  # points that the surrogate is fitted to, at most: a fit takes their third power
+BATCHES = 14  # that the calls of learning are divided into
+LEAST_BATCH = 4
+FIRST_CALLS = 12  # of the initial design, at least
+FIRST_CALLS_EACH = 2  # the same for each coordinate
+FIRST_SHARE = 1 / 3  # of the calls of learning, at most
+FIRST_WIDTH = 2.0  # deviation of every other point of the initial design; the others: the model's
+WARP_EVERY = 4  # batches after which the warp is chosen anew
+POPULATION_EVERY = 2  # batches after which candidates come from a new population
+UNSEEN_SHARE = 1 / 4  # of a batch, for places where nobody has looked
+UNSEEN_TRIED = 200  # directions that these are chosen from
+UNSEEN_NEAREST = 0.1  # quantile of the norms of failures: what is beyond it weighs little
+UNSEEN_FARTHER = 1.5  # times as far out, at most
+CANDIDATES = 4000  # points of a pool
+TRIED = 500  # of these, whose covariances are worked out
+WARPS = (1.0, 0.2, 0.04)  # tried beside none, as parts of the median distance
+TINY = 1e-300  # in place of a weight of 0
+ROUNDING = 1e-6  # part of the variance that rounding leaves of a difference of covariances
+
+
+class Learner:
+    """What is known so far: the calls, the surrogate of them, and the points that it leads to."""
+
+    def __init__(self, key: Any, sim: Simulator, budget: int, watch: Watch):
+        self.sim, self.budget, self.watch = sim, budget, watch
+        self.rng = numpy_generator(key)
+        self.dtype, self.dimension = latent.normal_numbers(sim), latent.dimension(sim)
+        self.z, self.distance = np.zeros((0, self.dimension)), np.zeros(0)
+        self.failing, self.invalid = np.zeros(0, bool), np.zeros(0, bool)
+        self.steps, self.spent = 0, 0
+        self.plain = (0, 0, 0)  # (failing, invalid, calls) of draws of the model
+        self.surrogate: Surrogate | None = None
+        self.fitted: list | None = None
+        self.pool: Pool | None = None
+        self.history: list[str] = []
+        self.calls = min(int(LEARNING * budget), CALLS)  # of learning
+        self.batch = max(self.calls // BATCHES, LEAST_BATCH)
+
+    def call(self, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Failures and invalid episodes [n] of the system at ``z`` [n, D], which are recorded."""
+        outcomes = []
+        for i in range(0, len(z), self.batch):
+            rows = np.asarray(z[i : i + self.batch], self.dtype)
+            o = answer_once(self._simulate, rows)
+            outcomes.append(o)
+            self.spent, self.steps = self.spent + len(rows), self.steps + int(o.length.sum())
+            self.record(rows, o.distance, o.failure, o.invalid)
+            self.watch.more(len(rows))
+        failure, invalid = zip(*((o.failure, o.invalid) for o in outcomes), strict=True)
+        return np.concatenate(failure), np.concatenate(invalid)
+
+    def _simulate(self, rows):
+        return latent.outcomes(self.sim, jnp.asarray(rows))
+
+    def record(self, z, distance, failing, invalid):
+        """Keep what was seen at ``z``."""
+        distance = np.where(failing, 0.0, np.asarray(distance, np.float64))
+        self.z = np.concatenate([self.z, z.astype(np.float64)])
+        self.distance = np.concatenate([self.distance, distance])
+        self.failing = np.concatenate([self.failing, failing])
+        self.invalid = np.concatenate([self.invalid, invalid | ~np.isfinite(distance)])
+
+    def fit(self, with_warp: bool) -> None:
+        """Fit the surrogate to what was seen; ``with_warp``: with the choice of its warp."""
+        rows = np.flatnonzero(~self.invalid)[:HELD]
+        data = self.z[rows], self.distance[rows], self.failing[rows]
+        if not with_warp and self.surrogate is not None:
+            self.surrogate = fit(*data, self.surrogate, self.surrogate.warp, rounds=1)
+            return
+        safe = self.distance[rows][~self.failing[rows]]
+        middle = float(np.median(safe)) if len(safe) else 0.0
+        warps = [math.inf, *(middle * w for w in WARPS if middle > 0)]
+        tried = [fit(*data, self.surrogate, warp) for warp in warps]
+        self.surrogate = max(tried, key=lambda surrogate: surrogate.evidence)
+
+    def draw_pool(self, n: int, anew: bool = True) -> None:
+        """Draw ``n`` points of the model around the failures that the surrogate expects."""
+        failures = self.z[self.failing]
+        self.pool, self.fitted = pool(self.rng, self.surrogate, failures, self.fitted, n, anew)
+
+
+def choose_calls(learner: Learner) -> None:
+    """The calls of the initial design and those that are chosen."""
+    batch = learner.batch
+    calls = learner.calls // batch * batch
+    first = min(max(FIRST_CALLS, FIRST_CALLS_EACH * learner.dimension), int(FIRST_SHARE * calls))
+    first = -(-first // batch) * batch
+    of_model = np.arange(first) % 2 == 0
+    width = np.where(of_model, 1.0, FIRST_WIDTH)[:, None]
+    failing, invalid = learner.call(width * learner.rng.standard_normal((first, learner.dimension)))
+    learner.plain = int(failing[of_model].sum()), int(invalid[of_model].sum()), int(of_model.sum())
+    i = 0
+    while True:
+        learner.fit(i % WARP_EVERY == 0)
+        if learner.spent >= calls:
+            break
+        learner.draw_pool(CANDIDATES, i % POPULATION_EVERY == 0)
+        unseen = int(UNSEEN_SHARE * batch) if learner.failing.any() else 0
+        chosen = _least_doubt(learner, batch - unseen)
+        learner.call(np.concatenate([_unseen(learner, unseen), chosen]))
+        i += 1
+    learner.history.append(
+        f"learning: {learner.spent} calls, {int(learner.failing.sum())} failures,"
+        f" {int(learner.invalid.sum())} invalid"
+    )
+
+
+def _unseen(learner, n):
+    """Points [n, D] a little farther out than the nearest failures, in directions that nobody has
+    looked in: for failures that the surrogate cannot know of.
+    """
+    if not n:
+        return np.zeros((0, learner.dimension))
+    radius = np.quantile(np.linalg.norm(learner.z[learner.failing], axis=1), UNSEEN_NEAREST)
+    z = latent.unit(learner.rng.standard_normal((UNSEEN_TRIED, learner.dimension)))
+    z *= radius * learner.rng.uniform(1.0, UNSEEN_FARTHER, (UNSEEN_TRIED, 1))
+    gaps, chosen = ((z[:, None] - learner.z[None]) ** 2).sum(axis=2).min(axis=1), []
+    for _ in range(n):
+        chosen.append(int(np.argmax(gaps)))
+        gaps = np.minimum(gaps, ((z - z[chosen[-1]]) ** 2).sum(axis=1))
+    return z[chosen]
+
+
+def _least_doubt(learner, n):
+    """The ``n`` candidates [n, D] that leave the least doubt."""
+    rng, candidates, surrogate = learner.rng, learner.pool, learner.surrogate
+    _, p = expected(surrogate, candidates.z)
+    doubt = candidates.weights * np.sqrt(p * (1 - p)) + TINY
+    if learner.invalid.any():  # nothing is learned there
+        doubt = np.where(learner.invalid[_nearest(candidates.z, learner.z)], TINY, doubt)
+    rows = rng.choice(len(p), TRIED, p=doubt / doubt.sum())
+    rows = np.unique(np.concatenate([rows, rng.choice(len(p), learner.batch, replace=False)]))
+    z = candidates.z[rows]
+    mean, _ = predict(surrogate, z)
+    # posterior covariances among them; what is known after a call at one of them falls by their
+    # squares, whatever its outcome
+    k = covariance(z, surrogate.z, surrogate.logs)[0]
+    c = covariance(z, z, surrogate.logs)[0] - k @ surrogate.inverse @ k.T
+    rounding = ROUNDING * float(np.exp(surrogate.logs[:2]).sum() + 1)
+    noise, chosen = surrogate.noise + rounding, []
+    for _ in range(n):
+        variance = np.maximum(np.diagonal(c), 0.0) + noise
+        most = np.sqrt(np.outer(variance, variance))  # rounding may have left more
+        c = np.clip(c, -most, most)
+        p = probability_below_zero(mean, DOUBT * np.sqrt(variance))
+        gain = (np.sqrt(p * (1 - p)) / variance) @ c**2 / variance
+        gain[chosen] = -1.0
+        best = int(np.argmax(gain))
+        chosen.append(best)
+        c = c - np.outer(c[:, best], c[:, best]) / variance[best]
+    return z[chosen]
+
+
+def _nearest(z, others):
+    """The number [n] of the nearest of ``others`` [m, D] to each of ``z`` [n, D]."""
+    return np.argmin((others**2).sum(axis=1) - 2 * z @ others.T, axis=1)

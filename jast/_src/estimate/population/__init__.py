@@ -1,0 +1,1 @@
+"""Populations of points on the device, moved down the levels of the miss distance."""

@@ -1,0 +1,146 @@
+"""Importance sampling after populations: Gaussians that are fitted to thousands of their failures
+draw the last part, where they promise more than further populations.
+
+Where failures lie in a curved set of many numbers no Gaussians serve, and their weights would not
+say so; the failures of populations do (`benchmarks.closed_loops`: crossing, cart-pole).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import jax
+import numpy as np
+
+from jast._src.core.counter_prng import numpy_generator
+from jast._src.estimate.diagnostics import tail_size
+from jast._src.estimate.estimate import Estimate
+from jast._src.estimate.gaussians.family import defensive_parts
+from jast._src.estimate.gaussians.mixture_fit import as_latent, fit_mixture
+from jast._src.estimate.importance_sampling import chunk_size
+from jast._src.estimate.population.failure_sample import sample_from
+from jast._src.estimate.population.particle_moves import LANES
+from jast._src.estimate.population.search import Answer, Kind, PopulationSearch, pool_answers
+from jast._src.estimate.proposal_search.final_draws import draw_estimate
+from jast._src.estimate.proposal_search.mixture_draws import log_ratio
+from jast._src.normal_space.transform import Latent, dimension, normal_numbers
+from jast._src.runtime.progress_bar import Watch
+
+__all__ = ["importance_estimate"]
+
+TARGET_ERROR = 0.005
+"""Relative standard error at which it ends: no population checks a smaller one."""
+MAX_PRODUCTS = 5e10
+"""Products that the densities of a proposal may cost: some five seconds of a core."""
+MAX_COMPONENTS = 16
+"""Gaussians at most."""
+PLANNED_DRAWS = 100_000
+"""Draws that `MAX_PRODUCTS` are to pay: of long episodes there are fewer Gaussians."""
+PILOT_DIVISOR = 8
+"""Share of the draws, as its denominator, that is drawn first."""
+MAX_SHAPE = 0.5
+"""Pareto shape of weights above which they have no variance (Vehtari and others 2024)."""
+SHAPE_ERRORS = 2.0
+"""Standard errors that the shape of a pilot is above `MAX_SHAPE` where its weights are rejected. Of
+sums of ten numbers, which Gaussians serve, pilots say .51 to .60 by chance, one error above; of the
+follower in `benchmarks.time_to_answer`, which they do not, .6 to .75, two to five."""
+
+
+class FittedProposal(NamedTuple):
+    """A proposal, and what is expected of it."""
+
+    q: Latent
+    draws: int
+    """As many as serve"""
+    relative: float
+    """Relative standard error of these"""
+
+
+def importance_estimate(
+    search: PopulationSearch, name: str, kinds: Sequence[Kind], level: float
+) -> Estimate | None:
+    """The `Estimate` by Gaussians fitted to the failures of ``kinds``; None where populations
+    promise as much with what is left of the budget, and where its own weights speak against it.
+    """
+    left = (search.budget - search.spent) * PILOT_DIVISOR // (PILOT_DIVISOR + 1)
+    if left < LANES:
+        return None
+    copies = 2  # of each component there is a wide copy
+    affordable = MAX_PRODUCTS / (copies * PLANNED_DRAWS * dimension(search.sim) ** 2)
+    several = max(int(min(affordable, MAX_COMPONENTS)), 1)
+    samples = [sample_from(search.runs[k]) for k in kinds]
+    log_mean = pool_answers([search.answer(k) for k in kinds]).log_mean
+    fitted = [_fit_proposal(search, samples, log_mean, left, k) for k in sorted({1, several})]
+    best = min(fitted, key=lambda proposal: proposal.relative)
+    by_populations = search.answer(kinds[0]).relative  # and what they promise with the rest
+    if best.relative > by_populations / math.sqrt(1 + left / search.evaluations(kinds[0])):
+        return None
+    for_pilot, for_draws = jax.random.split(search.key)
+    pilot = best._replace(draws=max(best.draws // PILOT_DIVISOR, LANES))
+    found = _draw_estimate(search, name, "a pilot of importance sampling", for_pilot, pilot, level)
+    if found is None or search.interrupted:
+        return None
+    # the standard error of a shape by so long a tail (Smith 1987)
+    error = (1 + MAX_SHAPE) / math.sqrt(tail_size(found.samples) + 1)
+    if found.k_hat > MAX_SHAPE + SHAPE_ERRORS * error:
+        reason = f"Pareto k-hat above {MAX_SHAPE}: the weights have no variance"
+    else:
+        found = _draw_estimate(search, name, "importance sampling", for_draws, best, level)
+        if found is None or found.reliable:
+            return found
+        reason = "; ".join(found.warnings)
+    search.history.append(f"which is not used: {reason}")
+    return None
+
+
+def _fit_proposal(search, samples, log_mean, left, components):
+    """The `FittedProposal` of so many Gaussians at most, fitted to the first `Sample`. The second
+    moment of their weights, E[p / q | failure] / P, is the greatest one that a `Sample` tells.
+    """
+    points, log_w = samples[0].points.astype(np.float64), samples[0].log_weight
+    weights = np.exp(log_w - np.logaddexp.reduce(log_w))
+    g = fit_mixture(numpy_generator(search.key, 7), points, weights, len(points), limit=components)
+    q = as_latent(defensive_parts(g, 0.0, True), normal_numbers(search.sim))
+    log_moment = max(
+        np.logaddexp.reduce(a.log_weight - log_ratio(q, a.points, a.used))
+        - np.logaddexp.reduce(a.log_weight)
+        for a in samples
+    )
+    moment = math.exp(min(log_moment - log_mean, 700.0))  # e^700: no Gaussians serve
+    products = len(q.means) * points.shape[1] ** 2
+    wanted = min(moment / TARGET_ERROR**2, MAX_PRODUCTS / products, left)
+    draws = max(int(wanted), LANES)
+    return FittedProposal(q, draws, math.sqrt(moment / draws))
+
+
+def _draw_estimate(search, name, said, key, proposal, level):
+    """The `Estimate` of the draws of a `FittedProposal`, which are ``said`` to be so; None where an
+    interruption left none.
+    """
+    watch = Watch(name, proposal.draws, "episode", False, None)
+    ways = search.ways._replace(name=said.replace(" ", "-"))  # each has a checkpoint of its own
+    try:
+        found = draw_estimate(
+            key,
+            search.sim,
+            proposal.q,
+            chunk_size(proposal.draws),
+            watch,
+            ways,
+            spent=search.spent,
+            reasons=(),
+            drawn=int(search.plain[2]),
+            level=level,
+        )
+    except KeyboardInterrupt:
+        search.note_interruption()
+        return None
+    search.spent += found.samples
+    search.invalid += found.invalid
+    if found.samples < proposal.draws:
+        search.note_interruption()
+    answer = Answer(found.log_mean, found.relative_error)
+    search.history.append(f"{said}: {answer}, {found.samples} draws, k-hat {found.k_hat:.2f}")
+    return found

@@ -1,0 +1,229 @@
+"""A population of points of normal numbers that stays on the device: one compiled program draws it,
+moves it, and simulates it, whatever its level and its width.
+
+A move proposes a point that N(0, width^2 I) has as often as the old one, and is taken where the
+episode of the new point is at most at the level. Two kinds of moves alternate. The first changes
+all numbers a little (preconditioned Crank-Nicolson: Cotter, Roberts, Stuart and White 2013). On the
+way down the levels of the miss distance, the second keeps what led to the level and draws anew all
+that came after: every draw stays below it, as in splitting (Cerou and Guyader 2007). Among failures
+nothing comes after, and the second draws a few neighbouring numbers anew, which is a Gibbs move of
+a random window; in long episodes it mixes where small changes of everything do not.
+`python -m benchmarks.populations` measures them all.
+"""
+
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+
+from jast._src.core.simulator import Simulator
+from jast._src.normal_space.transform import dimension, normal_numbers, outcome_by_level
+
+__all__ = [
+    "AFTER",
+    "LANES",
+    "SMALL",
+    "WINDOW",
+    "Particles",
+    "Steering",
+    "allocate_particles",
+    "draw_particles",
+    "initial_steering",
+    "move_particles",
+    "record_crossings",
+]
+
+LANES = 128
+"""Points that are simulated side by side: their numbers then stay in the caches of a core."""
+TARGET_ACCEPTANCE = 0.35
+"""Share of the moves that are taken, to which their sizes are steered; .2 to .5 serve alike."""
+SMALL, WINDOW, AFTER, STAY = range(4)
+"""Kinds of moves: of all numbers, of some neighbours, of those after the level was reached; and the
+point as it is.
+"""
+SIZE_BOUNDS = 0.02, 1.0
+"""Least and greatest size of a move: 1 is an independent draw, or a window of all numbers."""
+FIRST_SIZES = 0.5, 0.3
+"""Of the two moves, before they are steered."""
+
+
+class Particles(NamedTuple):
+    """Points and what their episodes came to. On the device."""
+
+    z: jax.Array
+    """[n, D]"""
+    score: jax.Array
+    """[n] miss distance; -inf for a failure, inf for an invalid episode"""
+    used: jax.Array
+    """[n] int32: how many of the numbers decided the episode"""
+    square: jax.Array
+    """[n] sum of the squares of these"""
+    distance: jax.Array
+    """[n] miss distance, of failures too"""
+    reached: jax.Array
+    """[n] int32: how many of the numbers were used when the last level was reached"""
+
+
+class Steering(NamedTuple):
+    """Sizes of the two moves, and what became of them. On the host, [2] each."""
+
+    size: np.ndarray
+    """Of the small change, from 0 to 1; of the window, as a share of all numbers. What draws anew
+    all after a level has none."""
+    accepted: np.ndarray
+    """Share of the last moves that were taken"""
+
+
+def initial_steering() -> Steering:
+    """Before the first move."""
+    return Steering(np.array(FIRST_SIZES, np.float32), np.full(2, np.nan, np.float32))
+
+
+def allocate_particles(sim: Simulator, n: int) -> Particles:
+    """``n`` places for points."""
+    dtype = np.dtype(normal_numbers(sim))
+    zeros = np.zeros(n, dtype)
+    return jax.device_put(
+        Particles(
+            z=np.zeros((n, dimension(sim)), dtype),
+            score=zeros + np.inf,
+            used=np.zeros(n, np.int32),
+            square=zeros,
+            distance=zeros,
+            reached=np.zeros(n, np.int32),
+        )
+    )
+
+
+def draw_particles(
+    sim: Simulator, particles: Particles, key: jax.Array, n: int, width: float = 1.0
+) -> tuple[Particles, int]:
+    """``n`` new independent points of N(0, width^2 I) in the place of ``particles``, and how many
+    of their episodes are invalid.
+    """
+    rows = np.arange(n, dtype=np.int32)
+    steering = Steering(np.ones(2, np.float32), np.zeros(2, np.float32))
+    after, _, invalid = move_particles(
+        sim, particles, key, rows, steering, moves=1, level=np.inf, width=width
+    )
+    return after, invalid
+
+
+def record_crossings(
+    sim: Simulator, particles: Particles, key: jax.Array, rows: np.ndarray, level: float
+) -> Particles:
+    """The points of ``rows`` [m], which are at most at the ``level``, in the first m places, with
+    the moment at which each came to it.
+    """
+    after, _, _ = move_particles(
+        sim, particles, key, rows, initial_steering(), moves=1, level=level, kinds=(STAY, STAY)
+    )
+    return after
+
+
+def move_particles(
+    sim: Simulator,
+    particles: Particles,
+    key: jax.Array,
+    rows: np.ndarray,
+    steering: Steering,
+    *,
+    moves: int,
+    level: float,
+    width: float = 1.0,
+    before: float | None = None,
+    kinds: tuple[int, int] = (SMALL, WINDOW),
+) -> tuple[Particles, Steering, int]:
+    """The points of ``rows`` [m] after so many moves that keep N(0, width^2 I) given a score of at
+    most ``level``, in the first m places; their new sizes; invalid episodes that were met. What
+    stands in the other places means nothing.
+
+    ``before``: the width that the points were drawn with, where it was another one. Numbers that an
+    episode did not use are scaled to the new one, as nothing ties them. ``kinds``: of the moves,
+    which alternate.
+    """
+    dtype, live = np.dtype(particles.z.dtype), len(rows)
+    places = np.arange(len(particles.z), dtype=np.int32)
+    places[:live] = rows
+    ratio = 1.0 if before is None else width / before
+    counts = np.int32(live), np.int32(moves), np.array(kinds, np.int32)
+    numbers = (dtype.type(v) for v in (level, width, ratio))
+    out, size, accepted, invalid = _move_on_device(
+        sim, particles, key, places, steering.size, *counts, *numbers
+    )
+    return out, Steering(np.asarray(size), np.asarray(accepted)), int(invalid)
+
+
+@partial(jax.jit, donate_argnums=1)
+def _move_on_device(sim, particles, key, rows, size, live, moves, kinds, level, width, ratio):
+    n, d = particles.z.shape
+    lanes = min(LANES, n)
+    play = jax.vmap(lambda z: outcome_by_level(sim, z, level))
+    number = jnp.arange(d, dtype=jnp.int32)[None]
+    lane = jnp.arange(lanes, dtype=jnp.int32)
+
+    def change_all(z, noise, key, size, reached):
+        return jnp.sqrt(1 - size**2) * z + size * noise
+
+    def change_window(z, noise, key, size, reached):
+        begin = jnp.floor(jax.random.uniform(key, (lanes, 1), z.dtype) * d).astype(jnp.int32)
+        length = jnp.maximum(jnp.floor(size * d), 1).astype(jnp.int32)
+        return jnp.where(jnp.mod(number - begin, d) < length, noise, z)
+
+    def change_after(z, noise, key, size, reached):
+        return jnp.where(number < reached[:, None], z, noise)
+
+    def stay(z, noise, key, size, reached):
+        return z
+
+    by_kind = change_all, change_window, change_after, stay  # SMALL, WINDOW, AFTER, STAY
+
+    def block(i, carry, key, kind, size):
+        particles, accepted, invalid = carry
+        old = jax.tree.map(lambda a: lax.dynamic_slice_in_dim(a, i * lanes, lanes), particles)
+        for_noise, for_window = jax.random.split(jax.random.fold_in(key, i))
+        noise = width * jax.random.normal(for_noise, old.z.shape, old.z.dtype)
+        about = old.z, noise, for_window, size.astype(old.z.dtype), old.reached
+        z = lax.switch(kind, by_kind, *about)
+        o, reached = play(z)
+        score = o.score.astype(old.score.dtype)
+        proposed = Particles(
+            z=z,
+            score=score,
+            used=o.used,
+            square=jnp.sum(jnp.where(number < o.used[:, None], z**2, 0), axis=1),
+            distance=o.distance.astype(score.dtype),
+            reached=reached,
+        )
+        taken = score <= level
+        new = jax.tree.map(
+            lambda a, b: jnp.where(taken.reshape(-1, *(1,) * (a.ndim - 1)), a, b), proposed, old
+        )
+        particles = jax.tree.map(
+            lambda a, b: lax.dynamic_update_slice_in_dim(a, b, i * lanes, 0), particles, new
+        )
+        own = i * lanes + lane < live
+        accepted += jnp.sum(taken & own, dtype=jnp.int32)
+        return particles, accepted, invalid + jnp.sum(o.invalid & own, dtype=jnp.int32)
+
+    def move(t, carry):
+        particles, size, accepted, invalid = carry
+        i = t % 2
+        run = partial(block, key=jax.random.fold_in(key, t), kind=kinds[i], size=size[i])
+        zero = jnp.zeros((), jnp.int32)
+        particles, taken, wrong = lax.fori_loop(
+            0, (live + lanes - 1) // lanes, run, (particles, zero, zero)
+        )
+        share = taken.astype(size.dtype) / live.astype(size.dtype)
+        steered = jnp.clip(size[i] * jnp.exp(share - TARGET_ACCEPTANCE), *SIZE_BOUNDS)
+        size, accepted = size.at[i].set(steered), accepted.at[i].set(share)
+        return particles, size, accepted, invalid + wrong
+
+    particles = jax.tree.map(lambda a: a[rows], particles)
+    unused = number >= particles.used[:, None]
+    particles = particles._replace(z=jnp.where(unused, ratio * particles.z, particles.z))
+    start = particles, size, jnp.zeros_like(size), jnp.zeros((), jnp.int32)
+    return lax.fori_loop(0, moves, move, start)

@@ -1,0 +1,197 @@
+"""population: the probability of a failure by populations that stay on the device, and by whether
+ways that know nothing of each other agree.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import jax
+import numpy as np
+
+from jast._src.core.counter_prng import counter_key
+from jast._src.estimate.estimate import Estimate
+from jast._src.estimate.population.answer import (
+    estimate_from_plain_draws,
+    estimate_from_populations,
+)
+from jast._src.estimate.population.descents import SETTINGS, population_size
+from jast._src.estimate.population.importance import importance_estimate
+from jast._src.estimate.population.particle_moves import allocate_particles, draw_particles
+from jast._src.estimate.population.search import PopulationSearch
+from jast._src.normal_space import transform as latent
+from jast._src.runtime import work
+from jast._src.runtime.checkpoints import open_checkpoint
+from jast._src.runtime.memory import require
+from jast._src.runtime.progress_bar import Watch
+from jast._src.util.checks import check_random_key, whole_number
+from jast._src.util.display import call_settings
+from jast._src.util.intervals import checked_level
+
+if TYPE_CHECKING:
+    import chex
+
+    from jast._src.core.simulator import Simulator
+    from jast._src.core.typing import Callback, Executor, PathLike
+
+__all__ = ["by_populations", "episodes_a_second", "population"]
+
+MIN_BUDGET = 20_000
+"""Evaluations of a call at least: a population of 128 points meets 1e-6 within them."""
+MIN_PARTICLES = 128
+"""Points of a population at least: as many as are simulated side by side."""
+POINTS_DIVISOR = 500
+"""Share of the budget, as its denominator, that a population has as points: at 5 moves and 13
+levels, as of a probability of 1e-9, one takes an eighth of the budget."""
+TIMED_SECONDS = 0.05
+"""CPU seconds of the draws by which a rate is measured."""
+
+
+def population(
+    key: chex.PRNGKey,
+    sim: Simulator,
+    budget: int = 2_000_000,
+    *,
+    particles: int = SETTINGS.particles,
+    level: float = 0.95,
+    progress: bool = False,
+    callback: Callback | None = None,
+    checkpoint: PathLike | None = None,
+    executor: Executor | None = None,
+    devices: Sequence[jax.Device] | None = None,
+) -> Estimate:
+    """The probability that a system fails, by populations of points that stay on the device: for
+    systems of which a CPU simulates ten thousand episodes a second or more.
+
+    A point is an episode as normal numbers. A population goes down the levels of the miss distance
+    (subset simulation, Au and Beck 2001), another one from wide noise to the model's own (which
+    needs no distance); both by the same few compiled programs. Populations are repeated within the
+    budget. Standard errors come from their genealogies (Lee and Whiteley 2018) and from their
+    spread, whichever is greater.
+
+    Where a mixture of Gaussians that is fitted to their failures promises a smaller error than
+    further populations, it draws the last part (importance sampling), down to a standard error of
+    half a per cent, and the populations check it.
+
+    Two ways that know nothing of each other must agree within three standard errors. Where only one
+    of them reaches failures, its moves are doubled until its answer stays. The model's own draws,
+    with which each population begins, are a third witness. Otherwise the estimate is UNRELIABLE and
+    says which way saw what; so it is with a relative standard error above 5 %, and with coarse
+    floats (`core.float_resolution`). Where plain draws tell the probability soonest, it draws
+    plainly.
+
+    A failure mode that no way meets is missing without a sign. A KeyboardInterrupt ends it with the
+    estimate of the populations that are done, and is raised where there is none. Host loop, not for
+    `jax.jit` or `jax.vmap`.
+
+    Args:
+        key: consumed.
+        sim: the simulator; its disturbances have quantile functions.
+        budget: episodes to simulate, at least 20,000, nearly: a population that has begun is ended.
+        particles: points of a population at most, at least 128; fewer where the budget is small,
+            or episodes have very many numbers.
+        level: of the interval, in (0, 1).
+        progress: whether to show a progress bar.
+        callback: called as ``callback(done, total, None)`` after each population, and at the end.
+        checkpoint: a folder that keeps finished populations. The same call then goes on where it
+            was stopped, to the same result.
+        executor: runs the populations: anything with ``submit(function, *args)``, such as the
+            executors of `concurrent.futures` and Dask's client. It changes no result.
+        devices: some of `jax.devices()`, one thread each. They change no result (docs/scale.md).
+
+    Returns:
+        `Estimate`; ``method`` and ``history`` say which ways were gone and how they agreed, and
+        ``proposal`` is a `Sample` of failures, which serves `jast.estimate.failure_samples`.
+
+    Raises:
+        ValueError: for a budget below 20,000, fewer than 128 particles, a level outside (0, 1),
+            disturbances without a quantile function, and where the simulator's functions do not fit
+            together.
+
+    Example:
+        >>> import jax, jast
+        >>> sim = jast.simulators.landing(b=0.5)  # truly 2.9e-4
+        >>> found = jast.estimate.population(jax.random.key(0), sim, 300_000)
+        >>> truth = float(jast.simulators.landing_probability(b=0.5))
+        >>> 0.8 < found.mean / truth < 1.25
+        True
+    """
+    name = "population"
+    check_random_key(name, key)
+    budget = whole_number(name, "budget", budget, MIN_BUDGET)
+    particles = whole_number(name, "particles", particles, MIN_PARTICLES)
+    level = checked_level(name, level)
+    latent.check(name, sim)
+    ways = work.placement(name, executor, devices)
+    with open_checkpoint(
+        name, checkpoint, key, sim=sim, budget=budget, particles=particles
+    ) as store:
+        found = by_populations(
+            name,
+            key,
+            sim,
+            budget,
+            particles=particles,
+            level=level,
+            watched=(progress, callback),
+            ways=ways._replace(store=store),
+        )
+    return found._replace(settings=call_settings(name, key, budget=budget, level=level))
+
+
+def episodes_a_second(key: jax.Array, sim: Simulator) -> float:
+    """How many episodes a population simulates in a CPU second (of an accelerator: a second), by
+    two timed draws after one that compiles.
+    """
+    on_cpu = jax.default_backend() == "cpu"
+    clock = time.process_time if on_cpu else time.perf_counter
+    n = population_size(sim, SETTINGS.particles)
+    particles, key = allocate_particles(sim, n), counter_key(key, 4)
+    particles, _ = draw_particles(sim, particles, key, MIN_PARTICLES)
+    m = MIN_PARTICLES
+    while True:  # an expensive system is not run 8192 times for this
+        begun = clock()
+        particles, _ = draw_particles(sim, particles, key, m)
+        jax.block_until_ready(particles)
+        spent = clock() - begun
+        if spent > TIMED_SECONDS or m == n:
+            return m / max(spent, 1e-9)
+        m = min(8 * m, n)
+
+
+def by_populations(
+    name: str,
+    key: jax.Array,
+    sim: Simulator,
+    budget: int,
+    *,
+    particles: int = SETTINGS.particles,
+    level: float = 0.95,
+    watched: tuple = (False, None),
+    ways: work.Placement = work.HERE,
+) -> Estimate:
+    """The `Estimate` of `population`, for the function of this ``name``."""
+    capacity = population_size(sim, particles)
+    n = population_size(sim, min(capacity, max(budget // POINTS_DIVISOR, MIN_PARTICLES)))
+    numbers = capacity * latent.dimension(sim) * np.dtype(latent.normal_numbers(sim)).itemsize
+    require(name, 4 * numbers, f"populations of {capacity} points", "use fewer particles")
+    with Watch(name, budget, "episode", *watched) as watch:
+        search = PopulationSearch(key, sim, budget, n=n, capacity=capacity, watch=watch, ways=ways)
+        search.run(search.first_kind("distance"), 1)
+        plain = search.plain_is_best()
+        if not plain and not search.interrupted:
+            search.run(search.first_kind("width"), 1)
+        kinds, by_weights = () if plain else search.choose_kinds(), None
+        if not kinds:  # plain draws are all that tells the probability
+            return estimate_from_plain_draws(search, name, level)
+        search.run_witness(kinds)
+        if len(kinds) == 2 and not search.interrupted:
+            by_weights = importance_estimate(search, name, kinds, level)
+        if by_weights is None:
+            search.fill(kinds[0], search.budget - search.spent)
+        else:
+            watch.reach(budget)
+            watch.tell()
+    return estimate_from_populations(search, name, kinds, level, by_weights)

@@ -1,0 +1,1 @@
+"""The search for a proposal: explore, adapt, audit, draw."""

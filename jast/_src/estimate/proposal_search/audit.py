@@ -1,0 +1,201 @@
+"""The audit of a proposal: failures that it hardly draws are looked for by populations that it was
+not fitted to. It absorbs what they find, or that becomes a reason against the estimate.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from jast._src.estimate.gaussians.mixture_fit import effective_sample_size
+from jast._src.estimate.host_populations import FINAL_MOVES, LEVEL_SHARE, equilibrate, explore
+from jast._src.estimate.proposal_search.adapt import adapt_proposal
+from jast._src.estimate.proposal_search.search_state import (
+    Family,
+    SearchState,
+    failure_log_ratios,
+    pooled_log_ratio,
+)
+
+__all__ = ["audit_proposal", "uncovered"]
+
+FORGOTTEN = "the proposal hardly draws some failures that wide noise led to"
+UNFINISHED = "the budget ran out before the search for lost failure modes was over"
+LEAST_BATCHES = 2  # that must be affordable for what was found to be absorbed and weighed
+MORE_LEVELS = 4  # that an audit must have room for, beyond those to the tolerated probability
+POPULATION_PART = 200  # of a budget, of which a population's points are one part at most
+
+
+class Missing(NamedTuple):
+    """Failures that the proposal hardly draws."""
+
+    share: float
+    """Their probability, as a multiple of what the proposal found; nan where nobody knows"""
+    points: Any
+    """[m] of its `Family`"""
+
+
+def audit_proposal(family: Family, state: SearchState) -> SearchState:
+    """The state after the audits. The proposal absorbs what they find, is fitted anew and audited
+    again; what the last one finds becomes a reason against the estimate.
+    """
+    state, cooled = _equilibrate_cooled(family, state)
+    settings = family.settings
+    end = settings.search_end * family.budget
+    for left in reversed(range(settings.audits)):
+        state = state._replace(reasons=())  # what is still wrong is said again
+        state, missing = _missing(family, state, cooled)
+        if not missing:
+            break
+        if not left or state.spent + LEAST_BATCHES * family.batch > end:
+            return _check_given(family, _report(state, missing))
+        for m in missing:
+            share = settings.absorbed_share_least if math.isnan(m.share) else m.share
+            state = family.absorb(state, m.points, share)
+        state = adapt_proposal(family, state, settings.audit_refits, end)
+    return _check_given(family, _check_uncovered_share(family, state))
+
+
+def uncovered(family: Family, state: SearchState, points: Any) -> np.ndarray:
+    """Which of the ``points`` the proposal does not cover [m]."""
+    return family.log_ratio(state.q, points) < _coverage_threshold(family, state)
+
+
+def _unseen(family, state, points):
+    """Which of the ``points`` neither the proposal nor the batches, all together, cover [m]."""
+    pooled = pooled_log_ratio(family, state, points)
+    return uncovered(family, state, points) & (pooled < _coverage_threshold(family, state))
+
+
+def _coverage_threshold(family, state):
+    """The log of q / p below which a failure is not covered: where its weight is more than
+    `coverage_factor` times the mean one, and where the draws that are left would be too few for a
+    part of the probability that matters (`uncovered_share`).
+    """
+    settings = family.settings
+    left = family.budget - state.spent
+    draws = settings.uncovered_share * left / settings.coverage_draws
+    return -state.log_mean - math.log(max(settings.coverage_factor, draws))
+
+
+def _equilibrate_cooled(family, state):
+    """The failures that wide noise led to as the model has them, after Markov moves; None where
+    there are none.
+    """
+    settings = family.settings
+    most = int(settings.burn_in_share * family.budget)
+    z = None if state.cooled is None else state.cooled[: max(most // settings.burn_in_moves, 1)]
+    if z is None or not len(z):
+        return state, None
+    key, everywhere = family.context.next_key(), family.exclusion(state.q, math.inf)
+    moves = settings.burn_in_moves
+    people, chain = equilibrate(key, family.sim, z, moves, covered=everywhere, max_evaluations=most)
+    rows = people.score == -np.inf
+    state = state.note(f"audit: {len(z)} failures of wide noise moved", chain.evaluations)
+    return family.as_points(state, people.z[rows], people.used[rows])
+
+
+def _missing(family, state, cooled):
+    """[`Missing`, ...] by populations, those of the search too, and by the ``cooled`` failures."""
+    settings = family.settings
+    state, found = _explore_uncovered(family, state)
+    missing = []
+    for share, p in [*found, *((1.0, p) for p in state.populations)]:
+        state, points = family.as_points(state, p.points, p.used)
+        rows = uncovered(family, state, points)
+        part = rows.sum() / max(len(rows), 1)
+        missing.append(Missing(share * part, family.select(points, rows)))
+        state = state.note(f"audit: {share:.2%} of the probability, {part:.0%} not covered")
+    missing = [m for m in missing if _unseen_mass(family, state, m) > settings.tolerated_mass]
+    if cooled is not None:
+        rows = _unseen(family, state, cooled)
+        state = state.note(f"audit: {rows.sum()} of {len(rows)} failures moved not covered")
+        if rows.sum() > max(settings.stray_share * len(rows), settings.stray_count):
+            missing.append(Missing(math.nan, family.select(cooled, rows)))
+    return state, missing
+
+
+def _explore_uncovered(family, state):
+    """A population down the levels of the miss distance that is kept out of what the proposal
+    covers: [(its probability as a multiple of what the proposal found, `Explored`)], or [].
+    """
+    settings = family.settings
+    least = state.log_mean + math.log(settings.tolerated_mass / 2)
+    room = settings.search_end * family.budget - state.spent
+    room = min(settings.audit_share * family.budget, room)
+    # as many points as can afford the levels down to there
+    fewest = settings.audit_population_least
+    size = int(room / (least / math.log(LEVEL_SHARE) + FINAL_MOVES + MORE_LEVELS))
+    size = min(size, max(family.budget // POPULATION_PART, fewest))
+    if size < fewest:
+        return state.with_reason(UNFINISHED), []
+    key = family.context.next_key()
+    outside = family.exclusion(state.q, _coverage_threshold(family, state))
+    most = int(settings.audit_overrun * room)
+    p = explore(
+        key, family.sim, size, covered=outside, min_log_probability=least, max_evaluations=most
+    )
+    state = state.note(f"audit: a population of {size}", p.evaluations)
+    if not p.complete:
+        state = state.with_reason(UNFINISHED)
+    return state, [(math.exp(min(p.log_mean - state.log_mean, 50)), p)] if p.reached else []
+
+
+def _unseen_mass(family, state, missing):
+    """What part of the probability no draw of any batch has come to: by chance, were all of the
+    missing share like each of its points (Poisson's law). Where batches have drawn such points,
+    they know them better than a population does.
+    """
+    if not missing.share:
+        return 0.0
+    ratio = pooled_log_ratio(family, state, missing.points)
+    expected = missing.share * state.size * np.exp(ratio + state.log_mean)
+    return missing.share * np.exp(-expected).mean()
+
+
+def _report(state, missing):
+    """The state with what is ``missing`` as a reason."""
+    shares = [m.share for m in missing if not math.isnan(m.share)]
+    if not shares:
+        return state.with_reason(FORGOTTEN)
+    size = _in_words(max(shares))
+    return state.with_reason(
+        f"failures that the proposal hardly draws may have {size} the probability that it found"
+    )._replace(missing=max(shares))
+
+
+def _check_uncovered_share(family, state):
+    """The state with a reason where much of the probability lies, by the batches, where the
+    proposal hardly draws, and few draws tell of it.
+    """
+    rows = failure_log_ratios(family, state.q, state.batches) < _coverage_threshold(family, state)
+    w = np.exp(state.log_weight - state.log_weight.max())
+    share = w[rows].sum() / w.sum()
+    settings = family.settings
+    if share <= settings.uncovered_share:
+        return state
+    if effective_sample_size(state.log_weight[rows]) >= settings.uncovered_ess:
+        return state
+    return state.with_reason(
+        f"{share:.0%} of the probability found lies where the proposal hardly draws"
+    )
+
+
+def _check_given(family, state):
+    """The state with a reason where failures that came with the call are hardly drawn."""
+    if state.given is None:
+        return state
+    missed = int(_unseen(family, state, state.given.points).sum())
+    if not missed:
+        return state
+    number = len(state.given.z)
+    return state.with_reason(f"the proposal hardly draws near {missed} of {number} failures given")
+
+
+def _in_words(share):
+    """``share`` of a whole: of large ones the size is not known, only that they are."""
+    if share < 1:
+        return f"{share:.0%} of"
+    return f"{share:.2g} times" if share < 100 else "far more than"

@@ -1,0 +1,312 @@
+"""A failure probability by a proposal that is found within the budget: explore, adapt, audit, draw.
+
+Two families of proposals are tried, mixtures of Gaussians and tilts of each step. They differ in
+where they begin, and in how they are fitted; the search is the same.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from jast._src.core.failures import Failures
+from jast._src.core.float_resolution import rounding_problem
+from jast._src.core.simulator import Simulator
+from jast._src.core.typing import Callback
+from jast._src.estimate import diagnostics, weight_sums
+from jast._src.estimate.estimate import Estimate, estimate_from_counts, estimate_from_weights
+from jast._src.estimate.gaussians.exploration import draw_model, explore_failures
+from jast._src.estimate.gaussians.family import GaussianFamily
+from jast._src.estimate.importance_sampling import Traces, chunks
+from jast._src.estimate.monte_carlo import simulate_points
+from jast._src.estimate.proposal_search.adapt import adapt_proposal
+from jast._src.estimate.proposal_search.audit import audit_proposal
+from jast._src.estimate.proposal_search.final_draws import draw_estimate
+from jast._src.estimate.proposal_search.search_state import (
+    Family,
+    SearchState,
+    is_efficient,
+    search_context,
+)
+from jast._src.estimate.proposal_search.settings import SETTINGS, SearchSettings
+from jast._src.estimate.subset_simulation import fallback_estimate
+from jast._src.estimate.tilts.exploration import (
+    absorb_given,
+    cool_failures,
+    descend_levels,
+    replay_given,
+)
+from jast._src.estimate.tilts.family import TiltFamily
+from jast._src.estimate.tilts.tilts import Tilts, shape
+from jast._src.estimate.weighted_draws import with_source
+from jast._src.normal_space import transform as latent
+from jast._src.runtime._jax import was_interrupted
+from jast._src.runtime.host_errors import runs_on_host
+from jast._src.runtime.progress_bar import Watch
+from jast._src.runtime.work import HERE, Placement
+
+__all__ = ["Request", "estimate_by_proposal"]
+
+UNUSABLE = "no proposal was found that draws failures in proportion to their probability"
+LEAST_BATCHES = 2  # that are drawn of the first Gaussians, whatever it cost to find them
+
+
+class Request(NamedTuple):
+    """What a call asks for."""
+
+    name: str
+    key: jax.Array
+    sim: Simulator
+    budget: int
+    gradients: bool = True
+    failures: Failures | None = None
+    failure_points: np.ndarray | None = None
+    """[m, D] their normal numbers"""
+    near: latent.Latent | Tilts | None = None
+    """The proposal of a similar system"""
+    level: float = 0.95
+    watched: tuple[bool, Callback | None] = (False, None)
+    """progress and callback"""
+    ways: Placement = HERE
+    settings: SearchSettings = SETTINGS
+
+
+class Search(NamedTuple):
+    """A family of proposals, and what its search knows."""
+
+    family: Family
+    state: SearchState
+
+    @property
+    def efficiency(self) -> float:
+        """Effective draws of a draw; 0 where plain draws or no draws serve better."""
+        usable = self.state.missing <= self.family.settings.missing_most
+        return self.state.efficiency if usable and is_efficient(self.state, 0.0) else 0.0
+
+    @property
+    def suffices(self) -> bool:
+        """Whether what is left of the budget tells the probability by the proposal."""
+        return self.efficiency * (self.family.budget - self.state.spent) > diagnostics.MIN_ESS
+
+    @property
+    def proposal(self) -> Any:
+        """What an `Estimate` keeps of it."""
+        return None if self.state.q is None else self.family.on_device(self.state.q)
+
+
+def estimate_by_proposal(request: Request) -> Estimate:
+    """The `Estimate` of a call."""
+    context, coarse = search_context(request.key), rounding_problem(request.sim)
+    reasons = [] if coarse is None else [coarse]
+    try:
+        return _draw(request, _search(request, context), reasons)
+    except (KeyboardInterrupt, jax.errors.JaxRuntimeError) as error:
+        if not was_interrupted(error):
+            raise
+        if not context.latest:
+            raise KeyboardInterrupt from error
+        return _estimate_by_batches(request, Search(*context.latest[-1]), reasons)
+
+
+def _search(request, context):
+    """The most efficient `Search`, audited."""
+    best, state, settings = None, SearchState(), request.settings
+    for search_family in _families(request):
+        if request.budget - state.spent < settings.next_family_share * request.budget:
+            break
+        search = search_family(request, context, state.for_next_family())
+        state = search.state
+        if best is not None:
+            best = best._replace(state=best.state.with_costs_of(state))
+        if best is None or (search.efficiency, state.log_p) > (best.efficiency, best.state.log_p):
+            best = search
+        if best.suffices and is_efficient(best.state, settings.family_efficiency):
+            best = _audit(best)
+            state = best.state
+            if best.suffices:
+                return best
+        if math.exp(min(state.log_mean, 0.0)) > settings.family_efficiency:
+            return best  # plain draws serve
+    return _audit(best) if best.suffices else best
+
+
+def _families(request):
+    """The searches, in the order in which they are tried."""
+    if _has_many_steps(request):
+        return _search_tilts, _search_gaussians
+    near = (_search_tilts,) if isinstance(request.near, Tilts) else ()
+    return *near, _search_gaussians, _search_mixed_tilts
+
+
+def _has_many_steps(request):
+    """Whether the system has many steps, or choices: tilts are then tried first."""
+    about, horizon = shape(request.sim), request.sim.horizon
+    return about.choices or about.choices0 or horizon >= request.settings.tilts_first_horizon
+
+
+def _search_gaussians(request, context, state):
+    """The `Search` for Gaussians."""
+    settings = request.settings
+    f = GaussianFamily(request.sim, request.budget, context, settings)
+    end = state.spent + settings.refits_end * (request.budget - state.spent)
+    state = draw_model(f, state)
+    if isinstance(request.near, latent.Latent):
+        start = state._replace(q=request.near, anchors=f.centres(request.near))
+        near = _adapt_near(f, start)
+        if is_efficient(near, settings.near_fitted_efficiency):
+            return Search(f, near)
+        state = near._replace(q=None, anchors=None)
+    gradients = request.gradients and not runs_on_host(request.sim)
+    state = explore_failures(f, state, request.failure_points, gradients)
+    if state.q is not None:
+        end = max(end, state.spent + LEAST_BATCHES * f.batch)
+        state = adapt_proposal(f, state, settings.refits, end)
+    return Search(f, state)
+
+
+def _search_tilts(request, context, state):
+    """The `Search` for tilts."""
+    settings = request.settings
+    f = TiltFamily(request.sim, request.budget, context, settings)
+    if isinstance(request.near, Tilts):
+        state = replay_given(f, state, request.failures)
+        fitting, q = f.near(request.near)
+        near = _adapt_near(fitting, state._replace(q=q))
+        if is_efficient(near, settings.family_efficiency):
+            end = near.spent + settings.given_share * request.budget
+            return Search(*absorb_given(fitting, near, end))
+        state = near.for_next_family()._replace(given=state.given)
+        if not _has_many_steps(request):
+            return Search(f, state)
+    return _descend_to_tilts(f, request, state, settings.tilts_share * request.budget)
+
+
+def _search_mixed_tilts(request, context, state):
+    """The `Search` for tilts of several Gaussians, with a part of what is left."""
+    settings = request.settings
+    f = TiltFamily(request.sim, request.budget, context, settings)
+    f = f._replace(components_each=settings.components_each)
+    room = settings.tilts_share_after * (request.budget - state.spent)
+    return _descend_to_tilts(f, request, state, room)
+
+
+def _descend_to_tilts(f, request, state, room):
+    """The `Search` for tilts down the levels of the miss distance, for ``room`` evaluations."""
+    settings, end = request.settings, state.spent + room
+    state = descend_levels(f, replay_given(f, state, request.failures), end)
+    if state.q is not None:
+        state = adapt_proposal(f, state, settings.refits, end)
+        single = f.components_each == 1 and f.about.normals
+        if single and state.efficiency < settings.single_efficiency:
+            f, before = f._replace(components_each=settings.components_each), state.spent
+            state = state._replace(q=f.refit(state)["refitted"])
+            last = before + settings.components_share * request.budget
+            state = adapt_proposal(f, state, settings.refits, last)
+            end += state.spent - before
+    return Search(*absorb_given(f, state, end + settings.given_share * request.budget))
+
+
+def _adapt_near(f, state):
+    """The state after a batch of a similar system's proposal, and where it is not efficient as it
+    is after some refits.
+    """
+    state = adapt_proposal(f, state.note("proposal of a similar system"), 1, math.inf)
+    failed = len(state.batches[-1].log_weight)
+    if not failed or is_efficient(state, f.settings.near_efficiency):
+        return state
+    return adapt_proposal(f, state, f.settings.near_refits, math.inf)
+
+
+def _audit(search):
+    """The `Search` after the audits of its proposal."""
+    f, state = search
+    state = cool_failures(f, state) if isinstance(f, TiltFamily) else state
+    return Search(f, audit_proposal(f, state))
+
+
+def _draw(request, search, reasons):
+    """The `Estimate` of what is left of the budget; ``reasons``: against it, whatever the search
+    found: by the proposal, by levels or by plain draws.
+    """
+    f, state = search
+    name, key, sim, level = request.name, request.key, request.sim, request.level
+    n = max(request.budget - state.spent, f.batch)  # a search of many parts may have spent all
+    watch = Watch(name, n, "episode", *request.watched)
+    often = math.exp(min(state.log_p, 0.0)) * n >= request.settings.plain_failures
+    about_proposal = [*reasons, *state.reasons]
+    if not search.suffices and not often and state.log_p > -math.inf:
+        found = fallback_estimate(key, sim, n, state.log_p, level, about_proposal or [UNUSABLE])
+        if found is not None:
+            spent, history = state.spent + found.episodes, (*state.history, *found.history)
+            return found._replace(episodes=spent, history=history, plain=state.plain)
+    if search.suffices or (search.efficiency and not often):
+        against = about_proposal if search.suffices else [*about_proposal, UNUSABLE]
+        return _draw_proposal(request, search, watch, against)
+    shared = key, sim, f.batch, n
+    total, notes, lost = chunks(simulate_points, shared, f.batch, watch, request.ways)
+    found = estimate_from_counts(
+        name,
+        total,
+        notes=notes,
+        reasons=[*reasons, *lost],
+        level=level,
+        history=state.history,
+        evaluations=state.spent + total.samples,
+        proposal=search.proposal,
+    )
+    return found._replace(draws=with_source(found.draws, key, f.batch, "model"))
+
+
+def _draw_proposal(request, search, watch, reasons):
+    """The `Estimate` by draws of the proposal, some of which are the model's own."""
+    (f, state), s = search, request.settings
+    surplus = 1 - 1 / (s.exact_error**2 * state.efficiency * watch.total)
+    share = np.clip(surplus, s.model_draws_least, s.model_draws_most)
+    found = draw_estimate(
+        request.key,
+        request.sim,
+        f.with_model(state.q, float(share)),
+        f.batch,
+        watch,
+        request.ways,
+        spent=state.spent,
+        reasons=reasons,
+        share=float(share),
+        drawn=state.plain[2],
+        plain=state.plain,
+        level=request.level,
+        history=state.history,
+    )
+    return found._replace(proposal=search.proposal)
+
+
+def _estimate_by_batches(request, search, reasons):
+    """The `Estimate` of the batches of a search that was interrupted, by the balance heuristic."""
+    state, none = search.state, np.zeros(len(search.state.log_weight))
+    failures = Traces(
+        log_weight=state.log_weight,
+        shares=none[:, None],
+        failure=none == 0,
+        invalid=none != 0,
+        length=none.astype(int),
+    )
+    total = weight_sums.add_traces(weight_sums.empty_sums(state.size), failures)._replace(
+        samples=state.size
+    )
+    said = (
+        f"interrupted after {state.spent} of {request.budget} evaluations: the estimate uses the"
+        " same episodes that chose the proposal"
+    )
+    return estimate_from_weights(
+        request.name,
+        total,
+        level=request.level,
+        reasons=[*reasons, said],
+        evaluations=state.spent,
+        proposal=search.proposal,
+        history=state.history,
+        plain=state.plain,
+    )

@@ -1,0 +1,195 @@
+"""Subset simulation, as an estimator of its own and as what is left where no proposal was found."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import jax
+import numpy as np
+
+from jast._src.core.simulator import Simulator
+from jast._src.estimate.estimate import Estimate, estimate_from_mean
+from jast._src.estimate.host_populations import FINAL_MOVES, LEVEL_SHARE, Explored, explore
+from jast._src.normal_space import transform as latent
+from jast._src.runtime import work
+from jast._src.runtime.backends import Task
+from jast._src.runtime.checkpoints import open_checkpoint
+from jast._src.runtime.memory import require_episodes
+from jast._src.runtime.progress_bar import Watch
+from jast._src.util.checks import check_random_key, whole_number
+from jast._src.util.display import call_settings
+from jast._src.util.intervals import checked_level, log_normal, student_factor
+
+if TYPE_CHECKING:
+    import chex
+
+    from jast._src.core.typing import Callback, Executor, PathLike
+
+__all__ = ["fallback_estimate", "subset_simulation"]
+
+LOST_MODE_REMARK = (
+    "a failure mode that few members of a population reach can be lost without a sign"
+)
+MIN_SAMPLES = 100
+"""Members of a population at least: levels are quantiles of them."""
+MIN_REPLICATES = 3
+"""Populations at least: their spread is the standard error."""
+FALLBACK_REPLICATES = 5
+"""Populations where no proposal was found."""
+MIN_LOG_PROBABILITY = -690.0
+"""Where a population gives up: the log of the least double, nearly."""
+MAX_REPLICATE_ERROR = 0.5
+"""Relative standard error of the populations above which they disagree. A convention."""
+
+
+def subset_simulation(
+    key: chex.PRNGKey,
+    sim: Simulator,
+    samples: int = 1000,
+    *,
+    replicates: int = 10,
+    level: float = 0.95,
+    progress: bool = False,
+    callback: Callback | None = None,
+    checkpoint: PathLike | None = None,
+    executor: Executor | None = None,
+    devices: Sequence[jax.Device] | None = None,
+) -> Estimate:
+    """Subset simulation (Au and Beck 2001): the mean of several independent populations.
+
+    The interval is that of the populations, log-normal; ``ess`` and ``max_share`` are of them too,
+    and ``samples`` counts the members of the last ones. It needs a miss distance that leads to
+    failures, and no gradient. A mode that few members reach is lost at times, and the others do not
+    show it. A population gives up below a probability of 1e-300. A KeyboardInterrupt ends it with
+    the estimate of the populations that are done, UNRELIABLE, and is raised where they are fewer
+    than 3.
+
+    Args:
+        key: consumed.
+        sim: the simulator; its disturbances have quantile functions.
+        samples: members of a population, at least 100.
+        replicates: populations, at least 3.
+        level: of the interval, in (0, 1).
+        progress: whether to show a progress bar.
+        callback: called as ``callback(done, total, None)`` after each population.
+        checkpoint: a folder that keeps finished units of the work. The same call then goes on where
+            it was stopped, to the same result.
+        executor: runs the units: anything with ``submit(function, *args)``, such as the executors
+            of `concurrent.futures` and Dask's client. It changes no result.
+        devices: some of `jax.devices()`, one thread each. They change no result (docs/scale.md).
+
+    Returns:
+        `Estimate`.
+
+    Raises:
+        ValueError: for fewer than 100 samples or 3 replicates, and as `failure_probability`.
+
+    Example:
+        >>> import jax, jast
+        >>> sim = jast.simulators.landing(b=0.5)
+        >>> found = jast.estimate.subset_simulation(jax.random.key(0), sim, 300, replicates=4)
+        >>> 0 < found.mean < 1e-2
+        True
+    """
+    name = "subset_simulation"
+    check_random_key(name, key)
+    samples = whole_number(name, "samples", samples, MIN_SAMPLES)
+    replicates = whole_number(name, "replicates", replicates, MIN_REPLICATES)
+    level = checked_level(name, level)
+    latent.check(name, sim)
+    require_episodes(name, sim, samples)
+    ways = work.placement(name, executor, devices)
+    about = dict(sim=sim, samples=samples, replicates=replicates)
+    with (
+        open_checkpoint(name, checkpoint, key, **about) as store,
+        Watch(name, replicates, "population", progress, callback) as watch,
+    ):
+        shared = jax.random.split(key, replicates), sim, samples
+        task = Task(_run_replicate, shared, lambda: Explored(*Explored._fields))
+        ran = work.run(
+            task,
+            replicates,
+            lambda runs, number, run: (*runs, run),
+            (),
+            watch,
+            ways._replace(store=store),
+        )
+    runs = ran.state
+    short = work.describe_missing("populations", ran, len(runs), replicates)
+    if len(runs) < MIN_REPLICATES:
+        raise KeyboardInterrupt if ran.ended == "" else RuntimeError(f"{name}: {short}")
+    reasons = [] if short is None else [short, *map(str, ran.incidents)]
+    settings = call_settings(name, key, samples=samples, replicates=replicates, level=level)
+    return estimate_from_replicates(name, runs, samples, level, reasons)._replace(settings=settings)
+
+
+def _run_replicate(shared, number, post):
+    """The `Explored` of a population, of arrays."""
+    keys, sim, samples = shared
+    found = explore(keys[number], sim, samples, min_log_probability=MIN_LOG_PROBABILITY)
+    return jax.tree.map(np.asarray, found)
+
+
+def estimate_from_replicates(
+    method: str, runs: Sequence[Explored], samples: int, level: float, reasons: Sequence[str] = ()
+) -> Estimate:
+    """The `Estimate` of independent populations of ``samples``; ``reasons`` speak against it."""
+    replicates = len(runs)
+    logs = np.array([float(r.log_mean) for r in runs])
+    history = tuple(
+        f"population: {len(r.levels)} levels, log p {r.log_mean:.3f}, {r.evaluations} evaluations"
+        for r in runs
+    )
+    seen, found = int(np.isfinite(logs).sum()), list(reasons)
+    if seen < replicates:
+        found.append(f"{replicates - seen} of {replicates} populations reached no failure")
+    log_mean = relative = max_share = math.nan
+    interval, ess = (0.0, 1.0), 0.0
+    if seen:
+        p = np.exp(logs - logs.max())
+        log_mean = float(logs.max()) + math.log(p.mean())
+        relative = float(p.std(ddof=1) / math.sqrt(replicates) / p.mean())
+        # few replicates: Student's t in place of the normal quantile, as a wider error
+        interval = log_normal(log_mean, relative * student_factor(replicates - 1, level), level)
+        ess, max_share = float(p.sum() ** 2 / (p**2).sum()), float(p.max() / p.sum())
+    if relative > MAX_REPLICATE_ERROR:
+        found.append(f"the replicates disagree: relative standard error {relative:.0%}")
+    return estimate_from_mean(
+        method,
+        log_mean,
+        relative,
+        level,
+        interval,
+        ess=ess,
+        max_share=max_share,
+        failing=sum(len(r.points) for r in runs),
+        samples=sum(max(len(r.points), samples) for r in runs),
+        episodes=int(sum(r.evaluations for r in runs)),
+        invalid=int(sum(r.invalid for r in runs)),
+        reliable=not found,
+        warnings=(*found, LOST_MODE_REMARK),
+        history=history,
+    )
+
+
+def fallback_estimate(
+    key: jax.Array, sim: Simulator, budget: int, log_mean: float, level: float, reasons: list[str]
+) -> Estimate | None:
+    """The `Estimate` of populations for ``budget`` evaluations, where ``log_mean`` is about what
+    they will find; None where the budget is too small.
+    """
+    levels = max(log_mean, MIN_LOG_PROBABILITY) / math.log(LEVEL_SHARE) + 2
+    most = budget // FALLBACK_REPLICATES
+    size = int(budget / FALLBACK_REPLICATES / (levels + FINAL_MOVES + 1))
+    if size < MIN_SAMPLES:
+        return None
+    runs = [
+        explore(k, sim, size, min_log_probability=MIN_LOG_PROBABILITY, max_evaluations=most)
+        for k in jax.random.split(key, FALLBACK_REPLICATES)
+    ]
+    if not any(r.reached for r in runs):
+        return None
+    said = f"this is the answer of subset simulation, {FALLBACK_REPLICATES} populations of {size}"
+    return estimate_from_replicates("failure_probability", runs, size, level, [*reasons, said])

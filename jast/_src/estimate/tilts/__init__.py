@@ -1,0 +1,1 @@
+"""Exponential tilts of each step as proposals."""

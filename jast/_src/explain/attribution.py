@@ -1,0 +1,219 @@
+"""attribution: the share of each disturbance in how near the system came to failing."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jast._src.core.counter_prng import numpy_generator
+from jast._src.core.episode import Episode
+from jast._src.core.simulator import Simulator
+from jast._src.normal_space.design_point_descent import differentiable
+from jast._src.normal_space.episode_point import (
+    EpisodePoint,
+    failing_point,
+    like_disturbances,
+    number_names,
+    number_steps,
+)
+from jast._src.util import checks, display
+
+if TYPE_CHECKING:
+    import chex
+
+
+__all__ = ["Attribution", "attribution"]
+
+POINTS = 128  # on the way from the mode to the episode
+PRINTED = 10  # disturbances
+
+
+@display.printable()
+class Attribution(NamedTuple):
+    """By how much each disturbance has lowered the miss distance.
+
+    Example:
+        >>> import jax.numpy as jnp, jast
+        >>> sim = jast.simulators.walk1d()
+        >>> failure = jast.replay(sim, jnp.full(30, 0.5).at[3].set(5.0))
+        >>> found = jast.explain.attribution(sim, failure, permutations=10)
+        >>> found.parts[0][0]  # the greatest is that of step 4
+        4
+    """
+
+    values: Any
+    """Like the disturbances [horizon, ...]: above 0 what led towards the failure. In units of the
+    distance; of the gradient, of the distance for each unit that the normal number goes on."""
+    start: Any
+    """The same of x0."""
+    error: Any
+    """Standard errors of ``values``; 0 where nothing is drawn at random."""
+    total: float
+    """Miss distance of the undisturbed system less that of the episode."""
+    method: str
+    parts: tuple[Any, ...]
+    """(step, name, value, error), the greatest first; step 0 is x0."""
+    residual: float
+    """``total`` less the sum of all values: what a sum of differences has left out. NaN of the
+    gradient, which need not sum to anything."""
+    evaluations: int
+    """Episodes simulated; one with its gradient counts as 4."""
+
+    def __str__(self) -> str:
+        lines = [f"{self.method}: the disturbances lowered the miss distance by {self.total:.4g}"]
+        for step, name, value, error in self.parts[:PRINTED]:
+            line = f"  step {step:4d}  {name:<12} {value:+10.4g}"
+            line += f" +- {error:.2g}" if error > 0 else ""
+            sums = self.total and not np.isnan(self.residual)
+            lines.append(line + (f"  {value / self.total:6.1%}" if sums else ""))
+        if len(self.parts) > PRINTED:
+            rest = sum(value for _, _, value, _ in self.parts[PRINTED:])
+            lines.append(f"  the other {len(self.parts) - PRINTED:3d} {'':<12} {rest:+10.4g}")
+        return "\n".join(lines)
+
+
+def attribution(
+    sim: Simulator,
+    episode: Episode,
+    method: Literal["shapley", "integrated", "gradient"] = "shapley",
+    *,
+    key: chex.PRNGKey | None = None,
+    permutations: int = 200,
+) -> Attribution:
+    """Which disturbances brought the failure about, and by how much?
+
+    The miss distance of the episode is compared with that of the undisturbed system, in which every
+    disturbance is at its mode. ``"shapley"`` (Shapley 1953): the mean of what each number changes
+    when the disturbances are put in, one after the other, in random orders; by simulation alone, so
+    for black boxes, too; the values sum to the whole. ``"integrated"`` (integrated gradients,
+    Sundararajan, Taly and Yan 2017): the gradient along the way from the mode to the episode; they
+    sum to the whole up to ``residual``. ``"gradient"``: the slope at the episode, just outside of
+    the failures, on the way from the mode.
+
+    Args:
+        sim: the simulator; its disturbances have quantile functions.
+        episode: one failure.
+        method: "shapley", "integrated" or "gradient".
+        key: of the orders; `jax.random.key(0)` by default.
+        permutations: orders, at least 2; each costs as many episodes as there are numbers. Every
+            other order is the one before it reversed (antithetic).
+
+    Returns:
+        `Attribution`.
+
+    Raises:
+        ValueError: for another method, where the distance has no finite gradient, and where
+            ``episode`` is not one failure of this simulator.
+
+    Example:
+        >>> import jax.numpy as jnp, jast
+        >>> sim = jast.simulators.walk1d()
+        >>> failure = jast.replay(sim, jnp.full(30, 0.5).at[3].set(5.0))
+        >>> found = jast.explain.attribution(sim, failure, permutations=10)
+        >>> int(jnp.argmax(jnp.abs(found.values)))
+        3
+    """
+    name = "attribution"
+    if method not in METHODS:
+        raise ValueError(f"{name}: method must be one of {sorted(METHODS)}, received {method!r}")
+    permutations = checks.whole_number(name, "permutations", permutations, 2)
+    key = jax.random.key(0) if key is None else key
+    checks.check_random_key(name, key)
+    g = failing_point(name, sim, episode)
+    quiet = g.judge(np.zeros((1, len(g.v)))).distance[0]
+    if not np.isfinite(quiet):
+        raise ValueError(
+            f"{name}: sim must have a finite miss distance when it is undisturbed, received {quiet}"
+        )
+    total = float(quiet - g.outcome.distance[0])
+    values, error, cost = METHODS[method](g, float(quiet), key, permutations)
+    x0, shaped = like_disturbances(g.sim, values)
+    steps, called = number_steps(g.sim), number_names(g.sim)
+    live = np.flatnonzero(g.v)
+    parts = [(int(steps[i]), called[i], float(values[i]), float(error[i])) for i in live]
+    parts.sort(key=lambda part: -abs(part[2]))
+    residual = np.nan if method == "gradient" else total - float(values.sum())
+    return Attribution(
+        values=shaped,
+        start=x0,
+        error=like_disturbances(g.sim, error)[1],
+        total=total,
+        method=method,
+        parts=tuple(parts),
+        residual=residual,
+        evaluations=g.judge.spent + cost,
+    )
+
+
+def _shapley(g: EpisodePoint, quiet: float, key: jax.Array, permutations: int):
+    """Means and standard errors [D], by pairs of orders."""
+    live, rng = np.flatnonzero(g.v), numpy_generator(key)
+    d, pairs = len(live), -(-permutations // 2)
+    seen = np.zeros((pairs, len(g.v)))
+    if not d:
+        return seen[0], seen[0], 0
+    for i in range(pairs):
+        order = rng.permutation(live)
+        for one in (order, order[::-1]):
+            # row k has the first k + 1 disturbances of the order
+            points = np.zeros((d, len(g.v)))
+            points[:, one] = np.tril(np.ones((d, d))) * g.v[one]
+            along = np.concatenate([[quiet], _checked_finite(g.judge(points).distance)])
+            seen[i, one] -= np.diff(along) / 2
+    error = seen.std(axis=0, ddof=1) / np.sqrt(pairs) if pairs > 1 else np.full(len(g.v), np.nan)
+    return seen.mean(axis=0), error, 0
+
+
+def _integrated(g: EpisodePoint, quiet: float, key: jax.Array, permutations: int):
+    """By the midpoint rule on the way from 0 to the episode."""
+    shares = (np.arange(POINTS) + 0.5) / POINTS
+    slopes = _gradients(g, shares[:, None] * g.v)
+    return -slopes.mean(axis=0) * g.v, np.zeros(len(g.v)), 4 * POINTS
+
+
+def _gradient(g: EpisodePoint, quiet: float, key: jax.Array, permutations: int):
+    """Just outside of the failures, where the distance is not yet flat."""
+    shares = 1 - np.geomspace(1e-5, 1, 2 * POINTS)
+    outside = shares[~g.judge(shares[:, None] * g.v).failure]
+    if not len(outside):
+        raise ValueError(
+            'attribution: method="gradient" needs a point outside of the failures on the line'
+            ' from the mode to the episode, and there is none; expected method="shapley" here'
+        )
+    slopes = _gradients(g, outside.max() * g.v[None])[0]
+    return -slopes * np.sign(g.v), np.zeros(len(g.v)), 4
+
+
+METHODS: dict[str, Callable] = {
+    "shapley": _shapley,
+    "integrated": _integrated,
+    "gradient": _gradient,
+}
+
+
+def _gradients(g: EpisodePoint, points: np.ndarray) -> np.ndarray:
+    slopes = np.asarray(_slopes(g.sim, jnp.asarray(points, g.judge.dtype)), np.float64)
+    if not np.isfinite(slopes).all() or not slopes.any():
+        raise ValueError(
+            "attribution: the miss distance has no finite gradient, or one of 0; expected"
+            ' method="shapley", which needs none'
+        )
+    return slopes
+
+
+@jax.jit
+def _slopes(sim: Simulator, points: jax.Array) -> jax.Array:
+    return jax.vmap(jax.grad(lambda z: differentiable(sim, z).distance))(points)
+
+
+def _checked_finite(distance: np.ndarray) -> np.ndarray:
+    if not np.isfinite(distance).all():
+        raise ValueError(
+            "attribution: the miss distance is not finite where only some of the disturbances"
+            " act; expected a finite one"
+        )
+    return distance.astype(np.float64)

@@ -1,0 +1,189 @@
+"""differential: where one version of a system fails and another does not."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax.tree_util import Partial
+
+from jast import distributions as D
+from jast._src.core.signature import outline
+from jast._src.core.simulator import Simulator
+from jast._src.stress_testing.report import Report
+from jast._src.util.pytrees import select, with_strong_types
+
+if TYPE_CHECKING:
+    import chex
+
+__all__ = ["differential", "regression"]
+
+
+class Both(NamedTuple):
+    """The state of two systems under the same disturbances."""
+
+    a: Any
+    b: Any
+    failed_a: chex.Array
+    failed_b: chex.Array
+    over_a: chex.Array
+    over_b: chex.Array
+    nearest: chex.Array
+    """Miss distance of b so far"""
+    t: chex.Array
+    """int32: steps"""
+
+
+def differential(
+    key: chex.PRNGKey, sim_a: Simulator, sim_b: Simulator, budget: int = 200_000, **settings: Any
+) -> Report:
+    """Which disturbances make version b fail, and not version a; and how probable is that?
+
+    `jast.stress` on `regression` ``(sim_a, sim_b)``. ``report.failures`` are likeliest first; their
+    disturbances replay in both simulators (`jast.replay`). ``report.probability`` is that of a
+    regression.
+
+    Args:
+        key: consumed.
+        sim_a: the former version.
+        sim_b: the new one, of disturbances with the same shapes.
+        budget: evaluations, each of both systems.
+        **settings: as of `jast.stress`.
+
+    Returns:
+        `Report`.
+
+    Raises:
+        ValueError: as `regression` and `jast.stress`.
+
+    Example:
+        >>> import jax, jast
+        >>> old, new = jast.simulators.walk1d(threshold=10.0), jast.simulators.walk1d(threshold=8.0)
+        >>> report = jast.explain.differential(jax.random.key(0), old, new, 1000)
+        >>> bool(report.failures.best.failure)
+        True
+    """
+    from jast.stress_testing import stress
+
+    return stress(key, regression(sim_a, sim_b), budget, **settings)
+
+
+def regression(sim_a: Simulator, sim_b: Simulator) -> Simulator:
+    """Both systems under the same disturbances, as one simulator that fails where ``sim_b`` fails
+    and ``sim_a`` comes to its end without a failure.
+
+    The disturbances are those of b's model for as long as b runs, and then of a's. An episode ends
+    when b has come to its end without a failure, or a has failed, or both are over. The miss
+    distance is that of b; where both fail it is that of an undisturbed b, as no number tells how
+    far a is from not failing.
+
+    Args:
+        sim_a: the former version.
+        sim_b: the new one.
+
+    Returns:
+        An episodic `jast.Simulator`.
+
+    Raises:
+        ValueError: where the disturbances of the two, or of their starts, differ in shape.
+
+    Example:
+        >>> import jax.numpy as jnp, jast
+        >>> old, new = jast.simulators.walk1d(threshold=10.0), jast.simulators.walk1d(threshold=8.0)
+        >>> both = jast.explain.regression(old, new)
+        >>> there, back = jnp.ones(9), -jnp.ones(9)  # only the new version fails at 9
+        >>> bool(jast.replay(both, jnp.concatenate([there, back, jnp.zeros(12)])).failure)
+        True
+    """
+    a, b = outline(sim_a), outline(sim_b)
+    for part, one, other in (("disturbance", a.x, b.x), ("start", a.x0, b.x0)):
+        if _shapes(one) != _shapes(other):
+            raise ValueError(
+                f"regression: {part} of sim_a and sim_b must have the same shapes, received"
+                f" {_shapes(one)} and {_shapes(other)}"
+            )
+    return Simulator(
+        init=Partial(_init, sim_a, sim_b),
+        step=Partial(_step, sim_a, sim_b),
+        disturbance=Partial(_disturbance, sim_a, sim_b),
+        evaluate=Partial(_evaluate, sim_b),
+        horizon=max(sim_a.horizon, sim_b.horizon),
+        start=sim_b.start,
+        is_terminal=_is_terminal,
+        observe=Partial(_observe, sim_a, sim_b),
+        episodic=True,
+    )
+
+
+def _shapes(like):
+    return jax.tree.map(lambda s: (s.shape, str(s.dtype)), like)
+
+
+def _arrived(sim, state, t):
+    """(failed, over, miss distance) of one system at ``state`` after ``t`` steps."""
+    event, distance, *_ = sim.evaluate(state)
+    over = sim.is_terminal(state) | (t >= sim.horizon)
+    if sim.episodic:
+        event, distance = event & over, jnp.where(over, distance, jnp.inf)
+    return event, event | over, distance
+
+
+def _init(sim_a, sim_b, x0):
+    t = jnp.zeros((), jnp.int32)
+    a, b = with_strong_types(sim_a.init(x0)), with_strong_types(sim_b.init(x0))
+    failed_a, over_a, _ = _arrived(sim_a, a, t)
+    failed_b, over_b, distance = _arrived(sim_b, b, t)
+    return Both(
+        a=a,
+        b=b,
+        failed_a=failed_a,
+        failed_b=failed_b,
+        over_a=over_a,
+        over_b=over_b,
+        nearest=with_strong_types(distance),
+        t=t,
+    )
+
+
+def _step(sim_a, sim_b, state, x):
+    t = state.t + 1
+    # one that is over stays where it is
+    a = select(state.over_a, state.a, with_strong_types(sim_a.step(state.a, x)))
+    b = select(state.over_b, state.b, with_strong_types(sim_b.step(state.b, x)))
+    failed_a, over_a, _ = _arrived(sim_a, a, t)
+    failed_b, over_b, distance = _arrived(sim_b, b, t)
+    return Both(
+        a=a,
+        b=b,
+        failed_a=jnp.where(state.over_a, state.failed_a, failed_a),
+        failed_b=jnp.where(state.over_b, state.failed_b, failed_b),
+        over_a=state.over_a | over_a,
+        over_b=state.over_b | over_b,
+        nearest=jnp.where(state.over_b, state.nearest, jnp.minimum(state.nearest, distance)),
+        t=t,
+    )
+
+
+def _disturbance(sim_a, sim_b, state):
+    return D.where(state.over_b, sim_a.disturbance(state.a), sim_b.disturbance(state.b))
+
+
+def _is_terminal(state):
+    return state.failed_a | (state.over_b & ~state.failed_b) | (state.over_a & state.over_b)
+
+
+def _evaluate(sim_b, state):
+    event = state.failed_b & state.over_a & ~state.failed_a
+    both = state.failed_b & ~event
+    quiet = jnp.maximum(_quiet(sim_b).astype(state.nearest.dtype), 1e-3)
+    return event, jnp.where(both, quiet, state.nearest)
+
+
+def _quiet(sim):
+    """The miss distance of the start at its mode."""
+    return jnp.abs(sim.evaluate(with_strong_types(sim.init(D.mode(sim.start()))))[1])
+
+
+def _observe(sim_a, sim_b, state):
+    return jnp.concatenate([sim_a.observe(state.a), sim_b.observe(state.b)])

@@ -1,0 +1,243 @@
+"""minimal: the fewest and smallest disturbances of a failure that still make it fail."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from jast._src.core.episode import Episode, replay
+from jast._src.core.simulator import Simulator
+from jast._src.normal_space import transform as latent
+from jast._src.normal_space.episode_point import (
+    EpisodePoint,
+    failing_point,
+    like_disturbances,
+    number_names,
+    number_steps,
+)
+from jast._src.util import display
+from jast._src.util.checks import number, whole_number
+
+__all__ = ["Minimal", "minimal"]
+
+SECTIONS = 31  # places between two ends that are looked at together
+SWEEPS = 3  # rounds of shrinking one number after the other
+PRINTED = 12  # needed disturbances, and runs of steps
+
+
+@display.printable()
+class Minimal(NamedTuple):
+    """What a failure needs.
+
+    Example:
+        >>> import jax.numpy as jnp, jast
+        >>> sim = jast.simulators.walk1d()
+        >>> failure = jast.replay(sim, jnp.full(30, 0.01).at[3].set(12.0))
+        >>> found = jast.explain.minimal(sim, failure, orders=2)
+        >>> [part[0] for part in found.parts], bool(found.episode.failure)  # step 4 alone
+        ([4], True)
+    """
+
+    needed: Any
+    """bool, like the disturbances [horizon, ...]: those that are not at their mode."""
+    needed_start: Any
+    """bool, like x0."""
+    episode: Episode
+    """Fails with these alone, and with its states; the others are at the mode."""
+    parts: tuple[Any, ...]
+    """(step, name, value, normal number) of each that is needed, by step; step 0 is x0. The normal
+    number tells how unlikely a value is: 0 at the mode, about 1 a standard deviation from there.
+    """
+    numbers: int
+    """How many numbers the disturbances of the given episode have."""
+    evaluations: int
+
+    def __str__(self) -> str:
+        steps = sorted({step for step, *_ in self.parts})
+        are = "is" if len(self.parts) == 1 else "are"
+        count = f"{len(self.parts)} of {self.numbers} disturbances {are} needed"
+        lines = [f"{count}: {_steps_in_words(steps)}"]
+        lines += [
+            f"  step {step:4d}  {name:<12} {value:12.5g}   {z:+.2f} from the mode"
+            for step, name, value, z in self.parts[:PRINTED]
+        ]
+        if len(self.parts) > PRINTED:
+            lines.append(f"  ... {len(self.parts) - PRINTED} more")
+        return "\n".join(lines)
+
+
+def minimal(
+    sim: Simulator, episode: Episode, *, orders: int = 8, slack: float = 0.1, budget: int = 5000
+) -> Minimal:
+    """Which disturbances of a failure are needed, and how large must they be?
+
+    Disturbances are put back to the mode of their distribution for as long as the system still
+    fails, the small ones first, in several orders; of what is left the fewest are kept, none of
+    which can be spared. These are then shrunk towards the mode, together and one by one. Everything
+    is verified by simulation, so this holds for systems without gradients and for black boxes. (A
+    greedy search, as in delta debugging, Zeller and Hildebrandt 2002: there may be a smaller set
+    that no order leads to.)
+
+    Args:
+        sim: the simulator; its disturbances have quantile functions.
+        episode: one failure, an `jast.Episode`.
+        orders: in how many orders disturbances are tried, at least 1; the first is by size, the
+            others are shuffled.
+        slack: the share by which disturbances may grow in place of those that are put back, 0 or
+            more: of a failure that was pulled to where it is likeliest none could be spared.
+        budget: evaluations, at which the work ends with what it has by then. About 70 for each
+            needed disturbance and order.
+
+    Returns:
+        `Minimal`.
+
+    Raises:
+        ValueError: for bad arguments, and where ``episode`` is not one failure of this simulator.
+
+    Example:
+        >>> import jax.numpy as jnp, jast
+        >>> sim = jast.simulators.walk1d()
+        >>> failure = jast.replay(sim, jnp.full(30, 0.01).at[3].set(12.0))
+        >>> int(jast.explain.minimal(sim, failure, orders=2).needed.sum())
+        1
+    """
+    name = "minimal"
+    orders, budget = (
+        whole_number(name, "orders", orders, 1),
+        whole_number(name, "budget", budget, 1),
+    )
+    slack = number(name, "slack", slack, lambda v: 0 <= v < np.inf, "0 or more")
+    g = failing_point(name, sim, episode)
+    if (farther := g._replace(v=(1 + slack) * g.v)).judge(farther.v[None]).failure[0]:
+        g = farther
+    kept = _find_needed(g, orders, budget)
+    v = _shrink(g, np.where(kept, g.v, 0.0), budget)
+    e = latent.played(g.sim, v[None])
+    e = jax.device_get(replay(sim, jax.tree.map(lambda a: a[0], e._replace(states=None))))
+    kept &= number_steps(sim) <= int(e.length)
+    x0, needed = like_disturbances(sim, kept)
+    return Minimal(
+        needed=needed,
+        needed_start=x0,
+        episode=e,
+        parts=_parts(sim, e, v, kept),
+        numbers=int(g.outcome.used[0]),
+        evaluations=g.judge.spent,
+    )
+
+
+def _find_needed(g: EpisodePoint, orders: int, budget: int) -> np.ndarray:
+    """[D] bool: the fewest numbers that are not 0 at the end of any order."""
+    rng = np.random.default_rng(0)
+    size = np.abs(g.v)
+    live = np.flatnonzero(size)
+    with np.errstate(divide="ignore"):
+        noise = np.concatenate([np.zeros((1, len(live))), rng.gumbel(size=(orders - 1, len(live)))])
+        order = live[np.argsort(np.log(size[live]) + noise, axis=1)]
+    points = np.tile(g.v, (orders, 1))
+    # of each order what lies before ``at`` is decided
+    at = np.zeros(orders, int)
+    while (at < len(live)).any() and g.judge.spent < budget:
+        points, at = _advance(g, points, order, at)
+    counts = (points != 0).sum(axis=1)
+    best = points[np.lexsort(((points**2).sum(axis=1), counts))[0]]
+    return _spare_one_by_one(g, best, budget) != 0
+
+
+def _advance(g: EpisodePoint, points: np.ndarray, order: np.ndarray, at: np.ndarray):
+    """Put back as much of what comes next in each order as can be in one piece; the number behind
+    the piece stays.
+    """
+    n = order.shape[1]
+    low, high = at.copy(), np.full(len(at), n)  # all before low can be spared, not all before high
+    rows = np.flatnonzero(at < n)
+    first = True
+    while len(rows):
+        ends = [np.unique(np.linspace(low[i], high[i], SECTIONS + 1).round()) for i in rows]
+        tried = [e.astype(int)[1 : None if first else -1] for e in ends]
+        batch = [_at_mode(points[i], order[i, at[i] : e]) for i, t in zip(rows, tried) for e in t]
+        fails = iter(g.judge(np.stack(batch)).failure)
+        for i, t in zip(rows, tried):
+            good = [e for e in t if next(fails)]
+            low[i] = max(good, default=low[i])
+            high[i] = min((e for e in t if e > low[i]), default=high[i] if low[i] < high[i] else n)
+        rows, first = rows[high[rows] - low[rows] > 1], False
+    for i in np.flatnonzero(at < n):
+        points[i] = _at_mode(points[i], order[i, at[i] : low[i]])
+    return points, np.where(at < n, np.minimum(low + 1, n), at)
+
+
+def _at_mode(point: np.ndarray, which: np.ndarray) -> np.ndarray:
+    out = point.copy()
+    out[which] = 0.0
+    return out
+
+
+def _spare_one_by_one(g: EpisodePoint, point: np.ndarray, budget: int) -> np.ndarray:
+    """``point`` without what can be spared one by one."""
+    while g.judge.spent < budget and (left := np.flatnonzero(point)).size:
+        each = np.tile(point, (len(left), 1))
+        each[np.arange(len(left)), left] = 0.0
+        fails = g.judge(each).failure
+        if not fails.any():
+            break
+        point = each[fails][np.argmax(np.abs(point[left[fails]]))]
+    return point
+
+
+def _shrink(g: EpisodePoint, point: np.ndarray, budget: int) -> np.ndarray:
+    """``point`` nearer to the mode, all numbers at first and then each alone."""
+    left = np.flatnonzero(point)
+    point = _scale(g, point, left)
+    for _ in range(SWEEPS):
+        before = point
+        for i in left:
+            if g.judge.spent >= budget:
+                return point
+            point = _scale(g, point, np.array([i]))
+        if np.allclose(before, point, rtol=1e-3, atol=0):
+            break
+    return point
+
+
+def _scale(g: EpisodePoint, point: np.ndarray, which: np.ndarray) -> np.ndarray:
+    """``point`` with the numbers ``which`` shrunk by the least factor, to 1 / 1024, that leads over
+    failures alone.
+    """
+    low, high = 0.0, 1.0
+    for _ in range(2):
+        factors = np.linspace(high, low, SECTIONS + 2)[1:-1]
+        each = np.tile(point, (len(factors), 1))
+        each[:, which] *= factors[:, None]
+        fails = g.judge(each).failure
+        reached = len(fails) if fails.all() else int(np.argmin(fails))
+        low = factors[reached] if reached < len(fails) else low
+        high = factors[reached - 1] if reached else high
+    out = point.copy()
+    out[which] *= high
+    return out
+
+
+def _parts(sim: Simulator, e: Episode, v: np.ndarray, kept: np.ndarray) -> tuple:
+    each = [np.asarray(a).reshape(len(a), -1) for a in jax.tree.leaves(e.disturbances)]
+    first = [np.asarray(a).reshape(-1) for a in jax.tree.leaves(e.x0)]
+    values = np.concatenate([*first, np.concatenate(each, axis=1).reshape(-1)])
+    steps, called = number_steps(sim), number_names(sim)
+    return tuple(
+        (int(steps[i]), called[i], float(values[i]), float(v[i])) for i in np.flatnonzero(kept)
+    )
+
+
+def _steps_in_words(steps: list) -> str:
+    """ "steps 4 to 6, 9" """
+    runs: list[list[int]] = []
+    for step in steps:
+        if runs and step == runs[-1][1] + 1:
+            runs[-1][1] = step
+        else:
+            runs.append([step, step])
+    text = ", ".join(str(a) if a == b else f"{a} to {b}" for a, b in runs[:PRINTED])
+    more = ", ..." if len(runs) > PRINTED else ""
+    return f"step{'s' if len(steps) != 1 else ''} {text}{more}" if steps else "none"

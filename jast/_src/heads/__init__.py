@@ -1,0 +1,1 @@
+"""Networks that guide trees, and their training."""

@@ -1,0 +1,109 @@
+"""The rollout-policy head as a `Policy`: for rollouts of its own and for estimators, which need its
+density.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import jax
+import jax.numpy as jnp
+from jax.tree_util import Partial
+
+from jast import distributions as D
+from jast._src.core.policy import Policy
+from jast._src.core.signature import outline
+from jast._src.core.simulator import Simulator
+from jast._src.distributions.flat_rows import flat, unflat
+from jast._src.heads.heads import Heads, observation, policy_logits, sample_bins
+
+if TYPE_CHECKING:
+    import chex
+
+    from jast._src.core.typing import Actions
+
+__all__ = ["as_policy"]
+
+
+class Histogram(D.Distribution):
+    """Disturbances whose points in the unit cube (`jast.actions`) have a density constant in each
+    of equal cells: ``logits`` [d, bins].
+    """
+
+    def __init__(self, logits, actions, dist):
+        super().__init__()
+        self._logits, self._actions, self._dist = logits, actions, dist
+
+    @property
+    def event_shape(self):
+        return jax.tree.map(lambda s: s.shape, D.event_like(self._dist))
+
+    def sample(self, *, seed, sample_shape=()):
+        """One disturbance; ``sample_shape`` must be ()."""
+        if sample_shape != ():
+            raise ValueError(
+                f"Histogram: sample_shape must be (), received {sample_shape!r}: use jax.vmap over"
+                " keys"
+            )
+        u = sample_bins(self._logits, jax.random.uniform(seed, self._logits.shape[:1], jnp.float32))
+        event = D.event_like(self._dist)
+        return jax.tree.map(
+            lambda a, s: a.astype(s.dtype), self._actions.at(unflat(u, event), self._dist), event
+        )
+
+    def _sample_n(self, key, n):
+        return jax.vmap(lambda k: self.sample(seed=k))(jax.random.split(key, n))
+
+    def log_prob(self, value):
+        """Log density; floating disturbances only, since a cell need not hold whole integers."""
+        bins = self._logits.shape[1]
+        cell = jnp.clip(
+            jnp.floor(flat(self._actions.locate(value, self._dist)) * bins).astype(jnp.int32),
+            0,
+            bins - 1,
+        )
+        logs = jnp.take_along_axis(
+            jax.nn.log_softmax(self._logits, axis=1), cell[:, None], axis=1
+        ) + jnp.log(jnp.float32(bins))
+        base = self._actions.log_prob(value, self._dist)
+        return base + jnp.sum(logs).astype(base.dtype)
+
+
+def as_policy(sim: Simulator, heads: Heads, actions: Actions, power: chex.Numeric = 1.0) -> Policy:
+    """The policy head of some heads as a `jast.Policy`; x0 is drawn from the system's own start.
+
+    Args:
+        sim: the simulator.
+        heads: `Heads` with a policy head.
+        actions: those that it was trained on.
+        power: as in `HeadSettings`: 1 is the histogram that was learned.
+
+    Raises:
+        ValueError: without a policy head, and for disturbances that hold integers.
+
+    Example:
+        >>> import jax, jast
+        >>> sim = jast.simulators.walk1d()
+        >>> few = jast.heads.settings(round=2, hidden=(8,), steps=(5, 5), bins=4)
+        >>> found = jast.search.forest(
+        ...     jax.random.key(0), sim, trees=4, prunes=1, simulations=50, heads="rollout",
+        ...     actions=jast.actions.wide(2.0), head_settings=few, refine=0,
+        ... )
+        >>> policy = jast.heads.as_policy(sim, found.heads, jast.actions.wide(2.0))
+        >>> jast.rollout(jax.random.key(1), sim, policy).disturbances.shape
+        (30,)
+    """
+    if heads.policy is None:
+        raise ValueError("heads.as_policy: expected heads with a policy head, received none")
+    like = outline(sim).x
+    if not all(jnp.issubdtype(s.dtype, jnp.floating) for s in jax.tree.leaves(like)):
+        raise ValueError(f"heads.as_policy: expected a disturbance of floats, received {like}")
+    return Policy(
+        sim.start, Partial(_disturbance, sim, heads, actions, jnp.asarray(power, jnp.float32))
+    )
+
+
+def _disturbance(sim, heads, actions, power, state, t):
+    return Histogram(
+        power * policy_logits(heads, observation(sim, state)), actions, sim.disturbance(state)
+    )

@@ -1,0 +1,140 @@
+"""What heads learn from: the statistics of roots, and of all edges, as rows of numbers."""
+
+import functools
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jast._src.core import rewards
+from jast._src.core.episode import play_back
+from jast._src.distributions.flat_rows import flat
+from jast._src.heads.heads import observation
+
+__all__ = [
+    "Samples",
+    "join_samples",
+    "samples_of_edges",
+    "samples_of_episodes",
+    "samples_of_roots",
+]
+
+
+class Samples(NamedTuple):
+    """Rows of numbers, float32 on the host; only finite ones."""
+
+    seen: np.ndarray
+    """[m, n] observations."""
+    x: np.ndarray
+    """[m, d] disturbances; [m, 0] for a policy head."""
+    target: np.ndarray
+    """[m, d, bins] shares of the visits, or [m] rewards to come."""
+    dropped: int = 0
+    """Rows left out because something in them was not finite."""
+
+
+def samples_of_roots(sim, actions, roots, bins, good, first=0):
+    """`Samples` for a policy head, one a root, and for a value head, one an edge of a root, from
+    `Roots` [turns, B].
+
+    They come tree by tree, so that the groups in which trees grew do not show. Per root and number
+    of the disturbance, the target of the policy head is the share of the visits in each of ``bins``
+    equal cells of the unit interval that ``actions`` maps to it; only trees that are ``good`` [B]
+    count. Without ``bins`` there are none of the first kind. Roots at levels above ``first`` choose
+    x0 and teach nothing.
+    """
+    turns = len(roots.depth)
+    roots = _tree_by_tree(roots._replace(starts=()))
+    seen, x, shares = _root_rows(sim, actions, roots, bins)
+    good = np.repeat(good, turns)
+    use = roots.valid & good & (roots.depth >= first) & (jnp.sum(roots.visits, axis=1) > 0)
+    policy = (
+        None if bins is None else _finite_samples(use, seen, jnp.zeros((seen.shape[0], 0)), shares)
+    )
+    edges = roots.visits > 0
+    each = jnp.broadcast_to(seen[:, None], (*edges.shape, seen.shape[1]))
+    use = roots.valid & (roots.depth >= first)
+    value = _finite_samples(*map(_merge, (use[:, None] & edges, each, x, roots.q)))
+    return policy, value
+
+
+def join_samples(parts):
+    """Several `Samples` as one."""
+    return Samples(
+        *(np.concatenate(columns) for columns in zip(*(p[:3] for p in parts), strict=True)),
+        sum(p.dropped for p in parts),
+    )
+
+
+def samples_of_edges(edges, target="own"):
+    """`Samples` for a value head from `search.tree.edges.Edges`: Q(s, a), or the Q of the edge
+    that leads to s, as published (``target="parent"``).
+    """
+    edges = _tree_by_tree(edges)
+    return _finite_samples(
+        edges.valid, edges.seen, edges.x, edges.q if target == "own" else edges.parent_q
+    )
+
+
+def samples_of_episodes(sim, actions, episodes, bins, good):
+    """`Samples` for a policy head from whole episodes [B, ...], those of ``good`` [B]: at each
+    state, all of the histogram in the cell of what came next.
+    """
+    seen, shares, use = _episode_rows(sim, actions, episodes._replace(states=None), bins)
+    use, seen, shares = map(_merge, (use & good[:, None], seen, shares))
+    return _finite_samples(use, seen, np.zeros((use.size, 0)), shares)
+
+
+@functools.partial(jax.jit, static_argnames="bins")
+def _episode_rows(sim, actions, episodes, bins):
+    def one(episode):
+        states = play_back(
+            sim, rewards.STANDARD, episode.x0, episode.disturbances, episode.length
+        ).states
+
+        def step(state, x):
+            u = flat(actions.locate(x, sim.disturbance(state)))
+            return observation(sim, state), jax.nn.one_hot(_cells(u, bins), bins, dtype=jnp.float32)
+
+        rows = jax.vmap(step)(jax.tree.map(lambda a: a[:-1], states), episode.disturbances)
+        return *rows, jnp.arange(sim.horizon, dtype=jnp.int32) < episode.length
+
+    return jax.vmap(one)(episodes)
+
+
+def _cells(u, bins):
+    """The cell of each point of the unit interval."""
+    return jnp.clip(jnp.floor(u * bins).astype(jnp.int32), 0, bins - 1)
+
+
+@functools.partial(jax.jit, static_argnames="bins")
+def _root_rows(sim, actions, roots, bins):
+    def one(state, xs, visits):
+        if bins is None:
+            return observation(sim, state), jax.vmap(flat)(xs), ()
+        dist = sim.disturbance(state)
+        u = jax.vmap(lambda x: flat(actions.locate(x, dist)))(xs)  # [K, d]
+        n = visits.astype(jnp.float32)
+        shares = jnp.einsum(
+            "k,kdb->db", n, jax.nn.one_hot(_cells(u, bins), bins, dtype=jnp.float32)
+        ) / jnp.maximum(jnp.sum(n), 1)
+        return observation(sim, state), jax.vmap(flat)(xs), shares
+
+    return jax.vmap(one)(roots.state, roots.actions, roots.visits)
+
+
+def _merge(a):
+    """[n, m, ...] as [n * m, ...]."""
+    return a.reshape(-1, *a.shape[2:])
+
+
+def _tree_by_tree(rows):
+    """Rows [n, B, ...] as [B * n, ...]."""
+    return jax.tree.map(lambda a: _merge(np.swapaxes(a, 0, 1)), rows)
+
+
+def _finite_samples(use, *columns):
+    use, columns = np.asarray(use), [np.asarray(c, np.float32) for c in columns]
+    good = use & np.all([np.isfinite(c.reshape(len(c), -1)).all(1) for c in columns], axis=0)
+    return Samples(*(c[good] for c in columns), int((use & ~good).sum()))

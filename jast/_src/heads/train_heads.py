@@ -1,0 +1,235 @@
+"""Between two rounds of trees: heads are made, and learn from the statistics of the trees that are
+finished.
+"""
+
+import dataclasses
+import math
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jast import distributions as D
+from jast._src.core.check import contract
+from jast._src.core.signature import ask, outline
+from jast._src.core.simulator import Simulator
+from jast._src.heads.heads import (
+    Heads,
+    Moments,
+    observation,
+    policy_logits,
+    predicted_value,
+    update_moments,
+)
+from jast._src.heads.networks import make_head
+from jast._src.heads.samples import (
+    join_samples,
+    samples_of_edges,
+    samples_of_episodes,
+    samples_of_roots,
+)
+from jast._src.heads.train_head import HeadState, init_head, train_head
+from jast._src.runtime._jax import is_traced
+from jast._src.util.pytrees import count_numbers
+
+__all__ = ["HeadTraining", "init_heads", "train_heads", "with_moments"]
+
+
+class HeadTraining(NamedTuple):
+    """Heads, and where their training stands."""
+
+    heads: Heads
+    policy: HeadState | None
+    value: HeadState | None
+    lessons: tuple[dict, ...] = ()
+    """Of each round, name of the head -> `Lesson`."""
+
+
+def init_heads(key, sim, actions, heads, settings):
+    """The `HeadTraining` of ``heads``: "rollout", "value" or "both" to be made, or `Heads` to be
+    trained further. ValueError where they do not fit the simulator.
+    """
+    n, d = count_inputs(sim, actions, heads)
+    start = sim.init(D.sample(sim.start(), key))
+    seen = observation(sim, start)
+    if not is_traced(seen) and not bool(jnp.all(jnp.isfinite(seen))):
+        raise ValueError(
+            "observe: must return finite numbers where heads learn from them, received"
+            f" {np.asarray(seen)} at the start"
+        )
+    if isinstance(heads, str):
+        keys = jax.random.split(key)
+
+        def make(i, inputs, outputs):
+            return make_head(
+                keys[i],
+                inputs,
+                outputs,
+                hidden=settings.hidden,
+                activation=settings.activation[i],
+                first_activation=settings.first_activation,
+            )
+
+        policy = make(0, n, (d, settings.bins)) if heads in ("rollout", "both") else None
+        heads = Heads(policy, make(1, n + d, ()) if heads in ("value", "both") else None)
+    heads = with_moments(heads, n, d)
+    _check_outputs(heads, n, d)
+    both = heads.policy, heads.value
+    return HeadTraining(heads, *(head and init_head(head.params) for head in both))
+
+
+def count_inputs(sim: Simulator, actions: Any, heads: str | Heads) -> tuple[int, int]:
+    """The numbers that ``observe`` gives and that a disturbance has; ValueError where heads cannot
+    serve.
+    """
+    if not isinstance(heads, Heads) and heads not in ("rollout", "value", "both"):
+        raise ValueError(
+            'forest: heads must be None, "rollout", "value", "both" or jast.heads.Heads, received'
+            f" {heads!r}"
+        )
+    if isinstance(heads, Heads) and heads.policy is None and heads.value is None:
+        raise ValueError(
+            "forest: heads must have a policy or a value head, received Heads(None, None)"
+        )
+
+    if heads in ("rollout", "both") if isinstance(heads, str) else heads.policy is not None:
+        try:
+            ask(sim, lambda _, state, p: actions.locate(D.sample(p, jax.random.key(0)), p))
+        except ValueError as e:
+            raise ValueError(
+                "forest: a rollout head needs disturbances with a distribution function; use"
+                f' heads="value", or actions.uniform: {e}'
+            ) from e
+    about = outline(sim)
+    if about.observation is None:
+        contract("forest", sim, observed=math.inf)  # raises: it says what is wrong with observe
+    return math.prod(about.observation), count_numbers(about.x)
+
+
+def with_moments(heads: Heads, n: int, d: int) -> Heads:
+    """``heads`` with moments that leave everything as it is, where there are none."""
+    inputs = Moments.empty(n + d) if heads.inputs is None else heads.inputs
+    if inputs.mean.shape != (n + d,):
+        raise ValueError(
+            f"forest: heads must take {n + d} numbers ({n} observed, {d} of the disturbance),"
+            f" received heads that take {inputs.mean.shape[0]}"
+        )
+    returns = Moments.empty() if heads.returns is None else heads.returns
+    return dataclasses.replace(heads, inputs=inputs, returns=returns)
+
+
+def _check_outputs(heads, n, d):
+    """ValueError unless the heads return what they must."""
+    seen, x = jnp.zeros((n,), jnp.float32), jnp.zeros((d,), jnp.float32)
+    logits = f"logits of shape ({d}, bins), bins at least 2"
+    for name, takes, wanted, run in (
+        ("policy", n, logits, lambda: policy_logits(heads, seen)),
+        ("value", n + d, "a scalar", lambda: predicted_value(heads, seen, x)),
+    ):
+        if getattr(heads, name) is None:
+            continue
+        try:
+            out = jax.eval_shape(run)
+        except Exception as e:  # of whatever framework
+            why = (str(e) or type(e).__name__).splitlines()[0]
+            raise ValueError(
+                f"heads: the {name} head's apply(params, x) failed on x of shape ({takes},)"
+                f" float32: {why}"
+            ) from e
+        shape = getattr(out, "shape", None)
+        fits = shape is not None and (
+            len(shape) == 2 and shape[0] == d and shape[1] >= 2 if name == "policy" else shape == ()
+        )
+        if not fits or not jnp.issubdtype(out.dtype, jnp.floating):
+            raise ValueError(
+                f"heads: the {name} head returned"
+                f" {jax.tree.map(lambda s: f'{s.dtype}{list(s.shape)}', out)}, expected {wanted}"
+            )
+
+
+def train_heads(key, training, sim, actions, settings, batches):
+    """The `HeadTraining` after learning from a round's ``batches`` of trees, which have ``log``,
+    ``roots``, ``found`` and, for ``settings.edges="all"``, ``edges``.
+
+    A head whose loss or parameters come out NaN or infinite keeps those from before, and the
+    `Lesson` says so.
+    """
+    heads = training.heads
+    shares, edges = _samples(heads, sim, actions, settings, batches)
+    inputs, returns = heads.inputs, heads.returns
+    if settings.normalise:
+        inputs = update_moments(inputs, np.concatenate([edges.seen, edges.x], axis=1))
+        returns = update_moments(returns, edges.target)
+    observed = inputs.first(edges.seen.shape[1]), Moments.empty()
+    work = dict(
+        policy=(settings.loss, shares, observed), value=("squared", edges, (inputs, returns))
+    )
+    if settings.untrained_alone and heads.policy is None:
+        del work["value"]
+    keys, trained, lesson = jax.random.split(key), {}, {}
+    for i, name in enumerate(("policy", "value")):
+        head, state = getattr(heads, name), getattr(training, name)
+        if head is not None and name in work:
+            loss, samples, moments = work[name]
+            state, lesson[name] = train_head(
+                keys[i],
+                state,
+                head.apply,
+                moments,
+                samples,
+                loss=loss,
+                rate=settings.learning_rate[i],
+                batch=settings.batch[i],
+                steps=settings.steps[i],
+                capacity=settings.replay[i],
+            )
+        trained[name] = state
+    levels = heads.levels
+    if any(of.steps > 0 and not of.rejected for of in lesson.values()):
+        deepest = (
+            sim.horizon
+            if settings.episodes
+            else max(int(np.where(b.roots.valid, b.roots.depth, 0).max()) for b in batches)
+        )
+        levels = max(levels, deepest + 1)
+    new = (
+        state and getattr(heads, name)._replace(params=state.params)
+        for name, state in trained.items()
+    )
+    return HeadTraining(
+        Heads(*new, inputs, returns, levels), **trained, lessons=(*training.lessons, lesson)
+    )
+
+
+def _samples(heads, sim, actions, settings, batches):
+    """What the policy head (None without one) and the value head learn from."""
+    about = outline(sim)
+    n, first = heads.inputs.mean.shape[0] - count_numbers(about.x), int(about.random_start)
+    bins = None
+    if heads.policy is not None:
+        seen = jnp.zeros((n,), jnp.float32)
+        bins = jax.eval_shape(lambda: policy_logits(heads, seen)).shape[1]
+    good = best_trees(batches, settings.elite)
+    pairs = [
+        samples_of_roots(sim, actions, b.roots, bins, g, first)
+        for b, g in zip(batches, good, strict=True)
+    ]
+    shares, edges = ([pair[i] for pair in pairs] for i in range(2))
+    if heads.policy is not None and settings.episodes:
+        for b, g in zip(batches, good, strict=True):
+            # the best episode of each tree stands first
+            best = jax.tree.map(lambda a, g=g: a[: len(g)], b.found)
+            shares.append(samples_of_episodes(sim, actions, best, bins, g))
+    if heads.value is not None and settings.edges == "all":
+        edges = [samples_of_edges(b.edges, settings.target) for b in batches]
+    return None if heads.policy is None else join_samples(shares), join_samples(edges)
+
+
+def best_trees(batches, share):
+    """Of each batch, [B] bool: the trees among this ``share`` of all by the reward of their best
+    episode.
+    """
+    best = [np.where(np.isfinite(b.log), b.log, -np.inf).max(0) for b in batches]
+    least = np.quantile(np.concatenate(best), 1 - share, method="lower")
+    return [rewards >= least for rewards in best]

@@ -1,0 +1,240 @@
+"""Files of arrays: an npz that `numpy.load` opens without pickle, whose entry ``header`` is JSON
+with a format, a version and a checksum.
+
+What all of jast's files have in common. All arrays are NumPy's: they keep their dtype whatever the
+precision that JAX is set to.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import os
+import zipfile
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+if TYPE_CHECKING:
+    from jast._src.core.typing import PathLike
+
+__all__ = [
+    "arrays_of",
+    "check_array",
+    "check_part",
+    "check_structure",
+    "children_of",
+    "describe",
+    "named",
+    "pack",
+    "read",
+    "unpack",
+    "write",
+]
+
+Header = dict[str, Any]
+Arrays = dict[str, np.ndarray]
+
+
+def write(
+    path: PathLike,
+    format: str,
+    version: int,
+    header: Header,
+    arrays: Arrays,
+    *,
+    quick: bool = False,
+) -> None:
+    """Write ``arrays`` and ``header``, a dict that JSON can hold, to the file ``path``.
+
+    The write is atomic: an existing file is replaced only once the new one is complete. A ``quick``
+    write is not compressed and does not wait for the disk, so it survives the end of the process
+    but perhaps not a crash of the machine.
+    """
+    path = os.fspath(path)
+    part = f"{path}.{os.getpid()}.part"
+    entries = _entries(format, version, header, arrays)
+    try:
+        with open(part, "wb") as file:
+            (np.savez if quick else np.savez_compressed)(file, **entries)
+            file.flush()
+            if not quick:
+                os.fsync(file.fileno())
+        os.replace(part, path)
+    finally:
+        if os.path.exists(part):
+            os.unlink(part)
+
+
+def pack(format: str, version: int, header: Header, arrays: Arrays) -> bytes:
+    """The bytes of a file of `write`."""
+    file = io.BytesIO()
+    np.savez(file, **_entries(format, version, header, arrays))
+    return file.getvalue()
+
+
+def read(path: PathLike, formats: Mapping[str, int], kind: str) -> tuple[Header, Arrays]:
+    """Read a file of `write`: ``(header, arrays)``, with ``package``, the jast that wrote it, in
+    the header.
+
+    ValueError says why a file is refused: not ``kind``, which is of one of these ``formats``;
+    another version than that of its format; or damaged.
+    """
+    if os.path.isdir(path):
+        raise ValueError(f"load: {path} is not {kind} but a folder, such as checkpoint= makes")
+    with open(path, "rb") as file:
+        return unpack(file.read(), path, formats, kind)
+
+
+def unpack(
+    data: bytes, path: PathLike, formats: Mapping[str, int], kind: str
+) -> tuple[Header, Arrays]:
+    """`read` of the bytes of a file; ``path``: what errors call it."""
+    if data[:2] != b"PK":
+        raise ValueError(f"load: {path} is not {kind}")
+    try:
+        with zipfile.ZipFile(io.BytesIO(data)) as pack:
+            arrays = {
+                name.removesuffix(".npy"): np.lib.format.read_array(
+                    io.BytesIO(pack.read(name)), allow_pickle=False
+                )
+                for name in pack.namelist()
+            }
+        header = json.loads(arrays.pop("header").tobytes()) if "header" in arrays else {}
+    except Exception as error:  # a damaged zip fails in many ways
+        raise ValueError(
+            f"load: {path} is damaged or truncated ({type(error).__name__}: {error})"
+        ) from None
+    format = header.get("format") if isinstance(header, dict) else None
+    if format not in formats:
+        raise ValueError(f"load: {path} is not {kind}: its format is {format!r}")
+    if header.get("version") != formats[format]:
+        raise ValueError(
+            f"load: {path} has version {header.get('version')!r}, and this jast reads version"
+            f" {formats[format]}: use the jast that wrote the file, {header.get('package')}"
+        )
+    dtypes = header.get("dtypes", {})
+    if set(dtypes) != set(arrays):
+        raise ValueError(
+            f"load: {path} is damaged: its list of arrays and the arrays themselves differ in"
+            f" {sorted(set(dtypes) ^ set(arrays))}"
+        )
+    for name, dtype in dtypes.items():
+        if arrays[name].dtype.name != dtype:
+            arrays[name] = arrays[name].view(jnp.dtype(dtype))
+    if header.pop("sha256", None) != _checksum(header, arrays):
+        raise ValueError(f"load: {path} is damaged: its checksum does not match")
+    return header, arrays
+
+
+def named(parts: Mapping[str, Any]) -> Arrays:
+    """The arrays of a dict of pytrees, by the names "part.0", "part.1" ..."""
+    return {
+        f"{name}.{i}": np.asarray(leaf)
+        for name, part in parts.items()
+        for i, leaf in enumerate(jax.tree.leaves(part))
+    }
+
+
+def arrays_of(arrays: Arrays, name: str) -> list[np.ndarray]:
+    """The arrays of the part ``name`` of `named`."""
+    return [arrays[f"{name}.{i}"] for i in range(sum(key.startswith(f"{name}.") for key in arrays))]
+
+
+def children_of(node: Any) -> tuple[list[str], list | None]:
+    """Names and children of a node of a pytree; None in place of the children of a leaf."""
+    pairs, _ = jax.tree_util.tree_flatten_with_path(node, is_leaf=lambda child: child is not node)
+    if len(pairs) == 1 and pairs[0][1] is node:
+        return [], None
+    return [jax.tree_util.keystr(path) for path, _ in pairs], [child for _, child in pairs]
+
+
+def describe(tree: Any) -> Any:
+    """A pytree's structure in JSON: its nodes as [kind, names, children], an array as "array"."""
+    if tree is None:
+        return ["None", [], []]
+    names, children = children_of(tree)
+    if children is None:
+        return "array"
+    kind = f"the class {type(tree).__name__}"
+    if type(tree) is dict and all(isinstance(key, str) for key in tree):
+        kind, names = "dict", sorted(tree)
+    elif type(tree) in (tuple, list):
+        kind, names = type(tree).__name__, []
+    return [kind, names, [describe(child) for child in children]]
+
+
+def check_structure(path: PathLike, other: str, name: str, structure: Any, like: Any) -> None:
+    """ValueError unless ``structure``, of `describe`, is that of the pytree ``like``. ``other`` is
+    the argument that must fit, ``name`` a part of the file.
+    """
+    expected = describe(like)
+    if structure != expected:
+        raise ValueError(
+            f"load: {path} does not fit {other}: {name} has the structure {structure}, expected"
+            f" {expected}"
+        )
+
+
+def check_array(
+    path: PathLike, other: str, name: str, a: np.ndarray, like: Any, axes: int = 0
+) -> None:
+    """ValueError unless ``a``, without its first ``axes``, has the shape and the kind of number of
+    ``like``; the precision may differ.
+    """
+    shape = a.shape[axes:]
+    if shape != like.shape or _kind_of_number(a.dtype) != _kind_of_number(like.dtype):
+        raise ValueError(
+            f"load: {path} does not fit {other}: {name} has {a.dtype.name}{list(shape)}, expected"
+            f" {like.dtype.name}{list(like.shape)}"
+        )
+
+
+def check_part(
+    path: PathLike,
+    name: str,
+    structure: Any,
+    arrays: list[np.ndarray],
+    like: Any,
+    rows: tuple[int, ...],
+    axes: int = 1,
+) -> None:
+    """ValueError unless ``arrays``, the leaves of a part of this ``structure``, are those of the
+    simulator's value ``like``: after the first ``axes``, ``rows`` and then the shape of a value.
+    """
+    check_structure(path, "sim", name, structure, like)
+    for a, s in zip(arrays, jax.tree.leaves(like), strict=True):
+        check_array(path, "sim", name, a, jax.ShapeDtypeStruct((*rows, *s.shape), s.dtype), axes)
+
+
+def _kind_of_number(dtype: Any) -> Any:
+    kinds = jnp.floating, jnp.signedinteger, jnp.unsignedinteger
+    return next((kind for kind in kinds if jnp.issubdtype(dtype, kind)), dtype)
+
+
+def _entries(format: str, version: int, header: Header, arrays: Arrays) -> Arrays:
+    """What `numpy.savez` is to write."""
+    from jast import __version__  # not at import: the package imports this module
+
+    header = dict(format=format, version=version, package=__version__) | header
+    header["dtypes"] = {name: a.dtype.name for name, a in arrays.items()}
+    header["sha256"] = _checksum(header, arrays)
+    # extended floats have no NumPy name in a file, so they are stored as bits
+    bits = {
+        name: a.view(f"u{a.dtype.itemsize}") if a.dtype.kind == "V" else a
+        for name, a in arrays.items()
+    }
+    return dict(header=np.frombuffer(json.dumps(header).encode(), np.uint8), **bits)
+
+
+def _checksum(header: Header, arrays: Arrays) -> str:
+    digest = hashlib.sha256(json.dumps(header, sort_keys=True).encode())
+    for name in sorted(arrays):
+        a = arrays[name]
+        digest.update(f"{name} {a.dtype.name} {a.shape}".encode())
+        digest.update(np.ascontiguousarray(a).tobytes())
+    return digest.hexdigest()

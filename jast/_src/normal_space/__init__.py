@@ -1,0 +1,1 @@
+"""Episodes as points of independent standard normal numbers, and moves among them."""

@@ -1,0 +1,116 @@
+"""An episode as a point of normal numbers that are 0 at the mode, and back."""
+
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from jast._src.core.episode import Episode
+from jast._src.core.signature import outline
+from jast._src.core.simulator import Simulator
+from jast._src.distributions.flat_rows import unflat
+from jast._src.normal_space import transform as latent
+from jast._src.normal_space.evaluate_points import Judge
+from jast._src.normal_space.mode_coordinates import centred
+from jast._src.util.leaf_names import entry_places, leaf_name
+from jast._src.util.pytrees import count_numbers
+
+__all__ = [
+    "EpisodePoint",
+    "failing_point",
+    "like_disturbances",
+    "names_of_leaves",
+    "number_names",
+    "number_steps",
+    "used_numbers",
+]
+
+# by how much farther from the mode an episode is taken where it does not fail as recorded
+LIFTS = 0.0, 1e-6, 1e-5, 1e-4, 1e-3
+
+
+class EpisodePoint(NamedTuple):
+    """An episode that is to be explained."""
+
+    sim: Simulator
+    """Centred: 0 is the mode of every disturbance"""
+    judge: Judge
+    v: np.ndarray
+    """[D] float64; 0 where a number decided nothing"""
+    outcome: latent.Outcomes
+    """Of the point, one row"""
+
+
+def failing_point(name: str, sim: Simulator, episode: Episode) -> EpisodePoint:
+    """The `EpisodePoint` of an ``episode`` that must fail where it is replayed."""
+    if not isinstance(episode, Episode):
+        raise ValueError(
+            f"{name}: episode must be a jast.Episode (as of result.failures or jast.replay),"
+            f" received {type(episode).__name__}{': no failure was found' * (episode is None)}"
+        )
+    if np.ndim(episode.failure):
+        raise ValueError(
+            f"{name}: episode must be one episode, received a batch of shape"
+            f" {np.shape(episode.failure)}: choose one of them"
+        )
+    latent.check(name, sim)
+    of_modes = centred(sim)
+    one = jax.tree.map(lambda a: np.asarray(a)[None], episode._replace(states=None))
+    recorded = latent.normal_of(of_modes, one)[0].astype(np.float64)
+    judge = Judge(of_modes)
+    # the way to normal numbers and back rounds, and a refined failure lies on the edge of failing
+    for lift in LIFTS if bool(episode.failure) else LIFTS[:1]:
+        v = (1 + lift) * recorded
+        outcome = judge(v[None])
+        if outcome.failure[0]:
+            break
+    else:
+        raise ValueError(
+            f"{name}: episode must fail when it is replayed, received one that ends after"
+            f" {int(outcome.length[0])} steps without a failure"
+        )
+    v = np.where(np.arange(len(v)) < outcome.used[0], v, 0.0)
+    return EpisodePoint(of_modes, judge, v, outcome)
+
+
+def like_disturbances(sim: Simulator, row: np.ndarray) -> tuple[Any, Any]:
+    """The numbers ``row`` [D] in the shapes of x0 and of the disturbances [horizon, ...]."""
+    about = outline(sim)
+    start = count_numbers(about.x0)
+
+    def shaped(part: np.ndarray, like: Any) -> Any:
+        return jax.tree.map(
+            lambda a, s: np.asarray(a).astype(row.dtype).reshape(s.shape), unflat(part, like), like
+        )
+
+    rows = [shaped(part, about.x) for part in row[start:].reshape(sim.horizon, -1)]
+    return shaped(row[:start], about.x0), jax.tree.map(lambda *a: np.stack(a), *rows)
+
+
+def number_steps(sim: Simulator) -> np.ndarray:
+    """[D]: the step that each number belongs to, from 1; 0 for those of the start."""
+    about = outline(sim)
+    start, each = count_numbers(about.x0), count_numbers(about.x)
+    return np.concatenate([np.zeros(start, int), 1 + np.arange(sim.horizon * each) // max(each, 1)])
+
+
+def used_numbers(sim: Simulator, length: np.ndarray) -> np.ndarray:
+    """[n]: how many of the numbers decided something in episodes of ``length`` [n] steps."""
+    about = outline(sim)
+    return count_numbers(about.x0) + length * count_numbers(about.x)
+
+
+def number_names(sim: Simulator) -> list[str]:
+    """[D]: what each number is called: "x" or its field, with its place in an array."""
+    about = outline(sim)
+    return [*names_of_leaves(about.x0, "x0"), *names_of_leaves(about.x, "x") * sim.horizon]
+
+
+def names_of_leaves(like: Any, root: str) -> list[str]:
+    """What each number of ``like``, arrays or their shapes, is called: its field with its place in
+    an array, or ``root``.
+    """
+    out = []
+    for path, s in jax.tree_util.tree_flatten_with_path(like)[0]:
+        out += [leaf_name(path, root) + entry for entry in entry_places(s.shape)]
+    return out

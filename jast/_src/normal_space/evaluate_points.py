@@ -1,0 +1,75 @@
+"""Points of normal numbers judged by simulation, from the host, in one program whatever their
+number.
+"""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+
+from jast._src.core.simulator import Simulator
+from jast._src.normal_space import transform as latent
+from jast._src.runtime._jax import jit
+from jast._src.runtime.checkpoints import answer_once
+from jast._src.runtime.host_errors import runs_on_host
+
+__all__ = ["Judge", "judged", "lanes_of"]
+
+LANES = 4096  # points of a call at most
+BLOCK = 128  # points that run side by side
+HELD = 2**20  # numbers that a call may take
+
+
+class Judge:
+    """Judges points of ``sim`` and counts the episodes, ``spent``."""
+
+    def __init__(self, sim: Simulator):
+        self.sim, self.dtype, self.spent = sim, latent.normal_numbers(sim), 0
+
+    def __call__(self, points: np.ndarray) -> latent.Outcomes:
+        """`Outcomes` [m] of ``points`` [m, D]."""
+        self.spent += len(points)
+        return judged(self.sim, np.asarray(points, self.dtype))
+
+
+def judged(sim: Simulator, z: np.ndarray) -> latent.Outcomes:
+    """`Outcomes` of the points ``z`` [n, D], on the host. One program serves every ``n``; a black
+    box runs once a point, in batches of ``n``.
+    """
+    if runs_on_host(sim):
+        return answer_once(lambda z: latent.outcomes(sim, jnp.asarray(z)), z)
+    n, d = z.shape
+    lanes, out = lanes_of(d), []
+    for i in range(0, n, lanes):
+        part = z[i : i + lanes]
+        out.append(answer_once(partial(_padded, sim, lanes), part, rows=len(part)))
+    return out[0] if len(out) == 1 else latent.Outcomes(*map(np.concatenate, zip(*out)))
+
+
+def _padded(sim, lanes, z):
+    """`Outcomes` [lanes], of which the first ones are of ``z`` [n, D]."""
+    filled = np.zeros((lanes, z.shape[1]), z.dtype)
+    filled[: len(z)] = z
+    return _in_blocks(sim, filled, np.int32(len(z)))
+
+
+def lanes_of(d: int) -> int:
+    """Points of ``d`` numbers that one call of the program takes."""
+    return max(min(LANES, HELD // max(d, 1) // BLOCK * BLOCK), BLOCK)
+
+
+@jit
+def _in_blocks(sim, z, n):
+    """`Outcomes` of the first ``n`` of ``z``; of the others what is left of their blocks."""
+    run = jax.vmap(partial(latent.outcome, sim))
+    like = jax.eval_shape(run, z)
+
+    def block(i, out):
+        new = run(lax.dynamic_slice_in_dim(z, i * BLOCK, BLOCK))
+        place = partial(lax.dynamic_update_slice_in_dim, start_index=i * BLOCK, axis=0)
+        return jax.tree.map(place, out, new)
+
+    nothing = jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), like)
+    return lax.fori_loop(0, (n + BLOCK - 1) // BLOCK, block, nothing)

@@ -1,0 +1,335 @@
+"""A simulator as a limit state of normal numbers: an episode is a point z [D], under the model z ~
+N(0, I), and proposals are mixtures of Gaussians there.
+
+z holds the latents of x0 first, then those of x_1, x_2 ..: x_t is the quantile of p(x | s) at
+Phi(z_t). An episode that ends after n steps has used the first ``used`` numbers; the others decide
+nothing, so densities are taken over the used ones. With Cholesky factors, lower triangular, these
+are a cumulative sum.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+
+from jast import distributions as D
+from jast._src.core import actions as choices
+from jast._src.core.check import contract
+from jast._src.core.episode import Episode, replay, rollout
+from jast._src.core.policy import Policy
+from jast._src.core.rewards import likelihood
+from jast._src.core.signature import outline
+from jast._src.core.simulator import Simulator
+from jast._src.core.transition import Progress, advance, begin, conclude
+from jast._src.distributions.flat_rows import unflat
+from jast._src.normal_space.sequences import latent_policy
+from jast._src.runtime._jax import jit, quick
+from jast._src.runtime.host_errors import runs_on_host
+from jast._src.util.blocked_matmul import product, rows_of
+from jast._src.util.pytrees import count_numbers, map_in_lanes
+
+if TYPE_CHECKING:
+    import chex
+
+__all__ = [
+    "Latent",
+    "Outcomes",
+    "check",
+    "component",
+    "dimension",
+    "episodes",
+    "flat",
+    "is_model",
+    "latents",
+    "log_ratios",
+    "normal_numbers",
+    "normal_of",
+    "outcome",
+    "outcome_by_level",
+    "outcomes",
+    "outcomes_of",
+    "place",
+    "played",
+    "policy_of",
+    "side_by_side",
+    "unit",
+]
+
+ROWS = 2**18  # numbers that densities are worked out for at a time
+LANES = 32  # episodes that are played side by side, so that one program serves any number of them
+
+
+class Outcomes(NamedTuple):
+    """What episodes [n] came to."""
+
+    failure: chex.Array
+    """bool"""
+    distance: chex.Array
+    """Miss distance; inf where invalid"""
+    used: chex.Array
+    """int32: how many of the numbers of z decided it"""
+    length: chex.Array
+    """int32: steps"""
+    invalid: chex.Array
+    """bool"""
+    log_p: chex.Array | None = None
+    """Log density of its disturbances, relative to the mode where these have modes; None where
+    nobody asked"""
+
+    @property
+    def score(self):
+        """What a search minimises: the miss distance, -inf for a failure, inf for an invalid
+        episode.
+        """
+        on_host = isinstance(self.failure, np.ndarray)
+        where = np.where if on_host else jnp.where
+        return where(self.failure, -np.inf, where(self.invalid, np.inf, self.distance))
+
+
+class Latent(NamedTuple):
+    """A mixture of K Gaussians over z [D], one drawn a trace."""
+
+    log_weights: chex.Array
+    """[K], of sum 1 as probabilities; -inf for a component that is not used"""
+    means: chex.Array
+    """[K, D]"""
+    factors: chex.Array
+    """[K, D, D] lower Cholesky factors of the covariances"""
+    inverses: chex.Array
+    """[K, D, D] their inverses"""
+
+
+def check(function: str, sim: Simulator) -> None:
+    """ValueError unless the simulator fits the contract and its disturbances have a quantile
+    function.
+    """
+    contract(function, sim)
+    about = outline(sim)
+    for name, offer in (("disturbance", about.disturbance), ("start", about.start)):
+        if not offer.quantile:
+            raise ValueError(
+                f"{function}: {name}: {offer.kind} has no quantile function;"
+                " jast.estimate.monte_carlo needs none"
+            )
+
+
+def dimension(sim: Simulator) -> int:
+    """D."""
+    about = outline(sim)
+    return count_numbers(about.x0) + sim.horizon * count_numbers(about.x)
+
+
+def normal_numbers(sim: Simulator) -> Any:
+    """The float dtype of z."""
+    about = outline(sim)
+    return jnp.result_type(*(D.float_dtype(s.dtype) for s in jax.tree.leaves((about.x0, about.x))))
+
+
+def _simulate(
+    sim: Simulator, z: jax.Array, reward: Callable, level: Any = None
+) -> tuple[Progress, jax.Array, jax.Array | None]:
+    """The `Progress` at the end of the one episode of ``z`` [D], its steps, and of a ``level`` the
+    steps before the episode failed or its distance first came to it; differentiable in forward
+    mode.
+    """
+    policy, last = policy_of(sim, z), jnp.asarray(sim.horizon, jnp.int32)
+    begun = begin(sim, reward, D.mode(policy.start()))
+
+    def waited(p, steps):
+        if level is None:
+            return None
+        return steps + (~p.failure & (p.distance > level)).astype(steps.dtype)
+
+    def body(carry):
+        progress, t, steps = carry
+        x = D.mode(policy.disturbance(progress.state, t))
+        new = advance(sim, reward, progress, x, t + 1 >= last)
+        return new, t + 1, waited(new, steps)
+
+    none = jnp.zeros((), jnp.int32)
+    start = begun, none, waited(begun, none)
+    end, length, steps = lax.while_loop(lambda c: ~c[0].done, body, start)
+    return conclude(sim, reward, end), length, steps
+
+
+def unit(z: np.ndarray) -> np.ndarray:
+    """The directions of points ``z`` [..., D]; that of 0 is 0. On the host."""
+    return z / np.maximum(np.linalg.norm(z, axis=-1, keepdims=True), 1e-12)
+
+
+def outcome(sim: Simulator, z: jax.Array) -> Outcomes:
+    """`Outcomes` of the one episode of ``z`` [D], differentiable in forward mode."""
+    end, length, _ = _simulate(sim, z, likelihood(sim))
+    return outcomes_of(sim, end, length)
+
+
+def outcome_by_level(sim: Simulator, z: jax.Array, level: Any) -> tuple[Outcomes, jax.Array]:
+    """The same, and how many of the numbers were used when the episode failed or its distance first
+    came to the ``level``.
+    """
+    end, length, steps = _simulate(sim, z, likelihood(sim), level)
+    return outcomes_of(sim, end, length)._replace(log_p=None), _used(sim, steps)
+
+
+def outcomes_of(sim: Simulator, end: Progress, length: jax.Array) -> Outcomes:
+    """`Outcomes` of the `Progress` at the ends of episodes, and their steps."""
+    return Outcomes(
+        failure=end.failure,
+        distance=end.distance,
+        used=_used(sim, length),
+        length=length,
+        invalid=end.invalid,
+        log_p=end.reward,
+    )
+
+
+def _used(sim, steps):
+    """How many numbers the start and so many ``steps`` take."""
+    about = outline(sim)
+    return count_numbers(about.x0) + steps * count_numbers(about.x)
+
+
+@jit
+def outcomes(sim, z):
+    """`Outcomes` [n] of ``z`` [n, D]."""
+    return jax.vmap(partial(outcome, sim))(z)
+
+
+@quick
+def episodes(sim, z):
+    """The `jast.Episode` of each of ``z`` [n, D], without states."""
+
+    def one(z):
+        return rollout(jax.random.key(0), sim, policy_of(sim, z))._replace(states=None)
+
+    return jax.vmap(one)(z)
+
+
+def place(q: Latent, u: np.ndarray, e: np.ndarray) -> np.ndarray:
+    """Points [n, D] of the mixture ``q`` by uniform numbers ``u`` [n], of the components, and
+    normal ones ``e`` [n, D]. On the host.
+    """
+    k, z = component(q, u), np.empty_like(e)
+    for i in np.unique(k):
+        rows = k == i
+        z[rows] = np.asarray(q.means[i]) + product(e[rows], np.asarray(q.factors[i]).T)
+    return z
+
+
+def component(q: Latent, u: np.ndarray) -> np.ndarray:
+    """Which component of ``q`` each of the uniform numbers ``u`` [n] chooses."""
+    edges = np.cumsum(np.exp(np.asarray(q.log_weights)))
+    return np.minimum(np.searchsorted(edges, u, side="right"), _live(q) - 1)
+
+
+def is_model(q: Latent) -> np.ndarray:
+    """Which components [K] are the model itself: their draws are plain ones."""
+    unit = (np.asarray(q.factors) == np.eye(q.means.shape[1])).all(axis=(1, 2))
+    return unit & ~np.asarray(q.means).any(axis=1)
+
+
+def log_ratios(q: Latent, z: np.ndarray, used: np.ndarray) -> np.ndarray:
+    """log q_k - log p [n, K] over the first ``used`` [n] numbers of each of ``z`` [n, D], 0 for
+    components that are not used. On the host.
+    """
+    live, (n, d) = _live(q), z.shape
+    means, inverses = (np.asarray(a)[:live].astype(z.dtype) for a in (q.means, q.inverses))
+    shift = np.einsum("kij,kj->ki", inverses, means)[:, None]
+    diagonals = np.log(np.diagonal(inverses, axis1=1, axis2=2).astype(np.float64))
+    volumes = np.concatenate([np.zeros((live, 1)), np.cumsum(diagonals, axis=1)], axis=1)
+    out = np.zeros((n, len(q.log_weights)))
+    turned = inverses.transpose(0, 2, 1)
+    rows = max(min(ROWS // (live * d), rows_of(n, d * d)), 1)
+    for i in range(0, n, rows):
+        part, m = z[i : i + rows], used[i : i + rows]
+        e = np.matmul(part, turned) - shift
+        # the squares differ by (z - e)(z + e): no cancellation of two large sums
+        gap = part - e
+        if (m < d).any():
+            gap *= np.arange(d) < m[:, None]
+        ratio = 0.5 * np.einsum("knd,knd->kn", gap, part + e) + volumes[:, m]
+        out[i : i + rows, :live] = ratio.T
+    return out
+
+
+def _live(q):
+    """How many components are used: they come first."""
+    return int(np.isfinite(np.asarray(q.log_weights)).sum())
+
+
+def policy_of(sim: Simulator, z: jax.Array) -> Policy:
+    """The `Policy` that plays the one episode of ``z`` [D]."""
+    like = outline(sim)
+    size0 = count_numbers(like.x0)
+    return latent_policy(
+        sim,
+        choices.quantiles(),
+        unflat(z[:size0], like.x0),
+        jax.vmap(lambda row: unflat(row, like.x))(z[size0:].reshape(sim.horizon, -1)),
+    )
+
+
+def played(sim: Simulator, z: np.ndarray) -> Episode:
+    """The `jast.Episode` of each of ``z`` [n, D], without states. On the host."""
+    return side_by_side(sim, partial(episodes, sim), np.asarray(z, normal_numbers(sim)))
+
+
+def side_by_side(sim: Simulator, function: Callable, *rows: Any, lanes: int = LANES) -> Any:
+    """``function`` of ``rows`` [n, ...], ``lanes`` at a time (`map_in_lanes`); a black box plays
+    none twice.
+    """
+    size = len(jax.tree.leaves(rows)[0]) if runs_on_host(sim) else lanes
+    return map_in_lanes(size, function, *rows)
+
+
+def flat(sim: Simulator, z0: Any, z: Any) -> jax.Array:
+    """The points [n, D] of latents like x0 [n, ...] (``()``: one start) and x [n, horizon, ...]."""
+    steps = jnp.concatenate([a.reshape(*a.shape[:2], -1) for a in jax.tree.leaves(z)], axis=2)
+    parts = [a.reshape(len(steps), -1) for a in (*jax.tree.leaves(z0), steps)]
+    return jnp.concatenate([a.astype(normal_numbers(sim)) for a in parts], axis=1)
+
+
+@partial(jit, static_argnums=2)
+def latents(sim, recorded, of_start):
+    """The latents ([K, ...], [K, T, ...]) of recorded (x0, disturbances, lengths), 0 after the end
+    of each.
+    """
+
+    def one(x0, x, length):
+        zero = jnp.zeros(())
+        given = Episode(
+            x0=x0,
+            disturbances=x,
+            log_prob=zero,
+            distance=zero,
+            failure=zero.astype(bool),
+            length=length,
+            reward=zero,
+        )
+        e = replay(sim, given)
+        states = jax.tree.map(lambda a: a[:-1], e.states)
+        z = jax.vmap(lambda s, x: D.to_normal(sim.disturbance(s), x))(states, e.disturbances)
+        live = jnp.arange(sim.horizon, dtype=jnp.int32) < e.length
+        z = jax.tree.map(lambda a: jnp.where(live.reshape(-1, *(1,) * (a.ndim - 1)), a, 0), z)
+        return D.to_normal(sim.start(), x0) if of_start else (), z
+
+    return jax.vmap(one)(*recorded)
+
+
+def normal_of(sim: Simulator, given: Episode) -> np.ndarray:
+    """The points [n, D] of the episodes ``given`` [n]; numbers that decided nothing are 0."""
+    if not len(given.length):
+        return np.zeros((0, dimension(sim)), normal_numbers(sim))
+    recorded = given.x0, given.disturbances, np.asarray(given.length)
+    return side_by_side(sim, partial(_points, sim), recorded)
+
+
+@quick
+def _points(sim, recorded):
+    return flat(sim, *latents(sim, recorded, outline(sim).random_start))

@@ -1,0 +1,44 @@
+"""A report of `jast.stress` as the output of a notebook's cell."""
+
+from base64 import b64encode
+from typing import Any
+
+from jast._src.page.document import text
+from jast._src.stress_testing.report_words import advice, belief, headline, mode_facts, verdict_rows
+from jast._src.util.display import html_table
+
+__all__ = ["cell"]
+
+
+def cell(report: Any) -> str:
+    """HTML without styles or scripts of its own: what was found, the probability with its interval
+    and whether to believe it, and the first four modes, each with a picture where matplotlib is.
+    """
+    told = belief(report.probability)
+    reasons = "".join(f"<li>{text(reason)}</li>" for reason in told.reasons)
+    ours = "", "probability", "doubtful"
+    facts = {name: words for name, words in verdict_rows(report) if name not in ours}
+    facts["evaluations"] = f"{report.episodes:,}"
+    parts = [
+        f"<h3>{text(headline(report)[0])}</h3>",
+        f"<p>Probability of failure: <b>{text(told.value)}</b> {text(told.more)}<br>",
+        f"{text(told.badge)}</p><ul>{reasons}</ul>{html_table('', facts)}",
+    ]
+    for i, picture in enumerate(_pictures(report)):
+        failure = report.modes[i].failure if report.modes else report.failures[i]
+        words = " &middot; ".join(
+            text(f"{name} {value}") for name, value in mode_facts(report, i, failure)
+        )
+        parts.append(f"<p><b>Mode {i + 1}</b> {words}</p>{picture}")
+    return "".join([*parts, f"<p>{text(advice(report))}</p>"])
+
+
+def _pictures(report: Any) -> list[str]:
+    """An image of each mode."""
+    try:
+        from jast._src.plot.report import pictures
+
+        files = pictures(report)
+    except ImportError:  # matplotlib, which is an extra
+        return [""] * len(report.modes[:4])
+    return [f'<img src="data:image/png;base64,{b64encode(f).decode()}">' for f in files]

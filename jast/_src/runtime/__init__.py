@@ -1,0 +1,1 @@
+"""How long work runs: threads, devices, executors, bars, checkpoints, compilation."""

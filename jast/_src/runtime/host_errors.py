@@ -1,0 +1,167 @@
+"""What went wrong inside a system that runs on the host: kept with an example and counted, never
+raised, so that a search goes on.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import jax
+from jax.tree_util import Partial
+
+if TYPE_CHECKING:
+    from jast._src.core.simulator import Simulator
+
+__all__ = [
+    "Incident",
+    "KINDS",
+    "Log",
+    "incidents",
+    "merge_incidents",
+    "new_incidents",
+    "runs_on_host",
+    "sources",
+]
+
+GROUPS = 100  # different messages that a `Log` keeps apart at most: each has an example
+KINDS = {
+    "raised": "run the system on the example's disturbances to see it again",
+    "timed out": (
+        "increase time_limit if the system is only slow; otherwise the example's disturbances"
+        " make it hang"
+    ),
+    "died": (
+        "the process of the system ended: run the system on the example's disturbances in a"
+        " process of its own"
+    ),
+    "wrong answer": "return (event, distance): a bool and one number",
+    "NaN": (
+        "return a finite number for every input; an episode without one does not count as a"
+        " failure and has reward -inf"
+    ),
+    "not deterministic": (
+        "seed every random number generator at the start of a run, or make its draws part of the"
+        " disturbance"
+    ),
+    "unit left out": (
+        "a part of the work failed three times in the processes of the executor, and its results"
+        " are missing; fix the error it names, then make the same call again"
+    ),
+    "other": "fix those listed first: their examples show how",
+}
+"""The kinds of incidents, and what to do."""
+
+
+class Incident(NamedTuple):
+    """One kind of thing that went wrong, and its first example. NumPy and Python values.
+
+    Example:
+        >>> import jax, jast
+        >>> from jast import distributions as D
+        >>> broken = lambda x: 1 / 0
+        >>> sim = jast.blackbox.from_python(broken, horizon=2, disturbance=D.Normal(0.0, 1.0))
+        >>> invalid = jast.rollout(jax.random.key(0), sim)
+        >>> incident = jast.incidents.incidents(sim)[0]
+        >>> incident.kind, "ZeroDivisionError" in incident.message, incident.disturbances.shape
+        ('raised', True, (2,))
+    """
+
+    kind: str
+    """One of `KINDS`."""
+    message: str
+    """E.g. "raised ZeroDivisionError: division by zero (system.py:12)" """
+    count: int
+    """How often, the example included."""
+    x0: Any
+    """Initial disturbance of the example, ``()`` where the start is fixed; None where there is no
+    example
+    """
+    disturbances: Any
+    """[t, ...]: the disturbances of the example up to there, a pytree where a disturbance is one"""
+
+    def __str__(self) -> str:
+        named = self.message.startswith(self.kind)
+        said = self.message if named else f"{self.kind}: {self.message}"
+        return f"{self.count} x {said}; {KINDS[self.kind]}"
+
+
+class Log:
+    """Counts incidents by kind and message; may be shared by threads."""
+
+    def __init__(self):
+        self._groups, self._lock = {}, threading.Lock()
+
+    def add(self, kind, message, example):
+        """Count one more; ``example``: () -> (x0, disturbances), called for the first of a group
+        only.
+        """
+        with self._lock:
+            group = kind, message
+            if group not in self._groups and len(self._groups) >= GROUPS:
+                latest = f"more than {GROUPS} different messages; the latest: {kind}: {message}"
+                other = "other", latest[:200]
+                group = next((g for g in self._groups if g[0] == "other"), other)
+            if group not in self._groups:
+                self._groups[group] = Incident(*group, 0, *example())
+            incident = self._groups[group]
+            self._groups[group] = incident._replace(count=incident.count + 1)
+
+    def all(self):
+        """tuple of `Incident`, in the order of their first examples."""
+        with self._lock:
+            return tuple(self._groups.values())
+
+
+def sources(sim, name) -> Iterator[Any]:
+    """The functions behind a simulator's fields that have a method ``name``, each once; also those
+    bound by another function's arguments.
+    """
+    seen, left = set(), [sim]
+    while left:
+        for part in jax.tree.leaves(left.pop(), is_leaf=lambda p: isinstance(p, Partial)):
+            if isinstance(part, Partial):
+                left.append((part.args, part.keywords))
+                if callable(getattr(part.func, name, None)) and id(part.func) not in seen:
+                    seen.add(id(part.func))
+                    yield part.func
+
+
+def runs_on_host(sim):
+    """Whether the simulator runs on the host: a black box, slow and without gradients."""
+    return any(True for _ in sources(sim, "incidents"))
+
+
+def incidents(sim: Simulator) -> tuple[Incident, ...]:
+    """What has gone wrong so far in the host code behind a simulator, by kind and message.
+
+    Args:
+        sim: the simulator.
+
+    Returns:
+        A tuple of `Incident`; ``()`` for a simulator in JAX.
+
+    Example:
+        >>> import jast
+        >>> jast.incidents.incidents(jast.simulators.walk1d())
+        ()
+    """
+    return tuple(i for source in sources(sim, "incidents") for i in source.incidents())
+
+
+def merge_incidents(first, second):
+    """All incidents as one tuple, in which those of one kind and message are counted together."""
+    groups = {(i.kind, i.message): i for i in first}
+    for i in second:
+        group = i.kind, i.message
+        count = groups[group].count if group in groups else 0
+        groups[group] = groups.get(group, i)._replace(count=count + i.count)
+    return tuple(groups.values())
+
+
+def new_incidents(before, after):
+    """What is new in ``after`` (tuples of `Incident`): with the counts since ``before``."""
+    known = {(i.kind, i.message): i.count for i in before}
+    new = (i._replace(count=i.count - known.get((i.kind, i.message), 0)) for i in after)
+    return tuple(i for i in new if i.count > 0)

@@ -1,0 +1,224 @@
+"""The two phases of `jast.search.go_explore`, compiled: runs that explore from kept states, and
+runs that go on from states of failing episodes.
+"""
+
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+
+from jast._src.core.signature import outline
+from jast._src.runtime._jax import jit
+from jast._src.search.go_explore.archive import choose_cells, features, merge_cells
+from jast._src.search.go_explore.continued_runs import (
+    CHANGES,
+    Follow,
+    Noise,
+    continue_runs,
+    exploring_draws,
+    following_draws,
+    played_runs,
+    start_point,
+)
+from jast._src.search.lanes import Tally, select_lanes
+
+__all__ = ["Plan", "Traces", "improve_backward", "explore"]
+
+POINTS = 8
+"""States that are kept of a run at most."""
+FROM_START = 0.1
+"""Share of the runs that are from the start."""
+NEAREST = 0.5
+"""Share of the others that are from the states nearest to failure."""
+WIDTHS = 1.0, 1.0, 1.5, 2.0, 3.0, 4.0
+"""Of the noise, one of which a run draws from: a third draw from the model."""
+PERSISTING = 0.0, 0.0, 0.5, 0.9
+"""Shares of the noise that are the same at every step, one of which a run draws with."""
+COINS = np.uint32(3 << 30)
+"""Address of a run's choices, apart from those of its steps."""
+
+
+class Plan(NamedTuple):
+    """What is static."""
+
+    lanes: int
+    """Runs side by side."""
+    length: int
+    """The most steps of a run that explores."""
+    traces: int
+    """Failures that are made likelier side by side."""
+
+
+class Traces(NamedTuple):
+    """Failing episodes, and what is best known of each: P of them."""
+
+    x0: Any
+    rows: Any
+    length: jax.Array
+    reward: jax.Array
+
+
+@partial(jit, static_argnames="plan")
+def explore(key, sim, reward, cell, plan, cells, best, begin, end):
+    """Runs ``begin`` .. ``end - 1`` that explore: ((`Cells`, `BestEpisodes`), `Tally`)."""
+    draw, draw_start = exploring_draws(sim)
+    length = plan.length
+    way = np.unique(np.linspace(0, length - 1, POINTS).round().astype(np.int32))
+
+    def block(at, carry):
+        (cells, best), tally = carry
+        number, live, keys = _lanes(key, plan, at, begin, end)
+        noise, coins = _noise(sim, keys)
+        slot = choose_cells(cells, coins[:, 0], coins[:, 1], NEAREST)
+        anew = (coins[:, 2] < FROM_START) | ~jnp.any(cells.live)
+        x0 = jax.vmap(lambda k, own: draw_start(k, own, sim.start()))(keys, noise)
+        first = jax.vmap(partial(start_point, sim, reward), axis_size=plan.lanes)(x0)
+        points = select_lanes(anew, first, jax.tree.map(lambda a: a[slot], cells.points))
+        x0 = select_lanes(anew, x0, jax.tree.map(lambda a: a[slot], cells.x0))
+        rows = jax.tree.map(lambda a: a[slot], cells.rows)
+        until = jnp.where(live, points.t + length, 0)
+        ends, new, xs, points_on = continue_runs(
+            sim, reward, keys, points, until, draw, noise, length, keep=True
+        )
+        played = played_runs(sim, reward, x0, rows, points, ends, new, xs)
+        mark = jax.vmap(partial(features, sim))(ends.progress.state)
+        best = best.merge(played, live, number, mark)
+        tally = tally.add(_tally(played, new, live, number))
+
+        seen = cells.seen.at[jnp.where(live & ~anew, slot, len(cells.seen))].add(1, mode="drop")
+        good = (way[:, None] < new[None]) & ~points_on.progress.done[way] & live[None]
+        flat = partial(_rows_of, way)
+        lane = jnp.tile(jnp.arange(plan.lanes, dtype=jnp.int32), len(way))
+        cells = merge_cells(
+            sim,
+            cell,
+            key,
+            cells._replace(seen=seen),
+            jax.tree.map(flat, points_on),
+            good.reshape(-1),
+            lane,
+            (x0, played.episode.disturbances),
+            4 * plan.lanes,
+        )
+        return (cells, best), tally
+
+    return _blocks(block, plan, begin, end, (cells, best))
+
+
+@partial(jit, static_argnames="plan")
+def improve_backward(key, sim, reward, plan, best, traces, begin, end, since, whole):
+    """Runs ``begin`` .. ``end - 1`` that go on from states of ``traces``, ever earlier ones, as
+    many as ``whole`` before they are at the start: ((`BestEpisodes`, `Traces`), `Tally`).
+    """
+    draw, draw_start = following_draws(sim)
+    p, n = plan.traces, plan.lanes
+    own_of = jnp.arange(n, dtype=jnp.int32) % p
+
+    def block(at, carry):
+        (best, traces), tally = carry
+        number, live, keys = _lanes(key, plan, at, begin, end)
+        share = (at.astype(whole.dtype) - since) / whole
+        left = jnp.maximum(1 - share, 0) * traces.length.astype(whole.dtype)
+        back = jnp.minimum(left.astype(jnp.int32), traces.length - 1)
+        first = jax.vmap(partial(start_point, sim, reward), axis_size=p)(traces.x0)
+        until = jnp.maximum(back, 0)
+        points, steps, _, _ = continue_runs(
+            sim, reward, keys[:p], first, until, _copied, traces.rows, sim.horizon
+        )
+        mine = jax.tree.map(lambda a: a[own_of], (traces, points, back))
+        own = _ways(sim, keys, mine[0], mine[2])
+        points, x0 = mine[1], mine[0].x0
+        if outline(sim).random_start:
+            moved = jax.vmap(lambda k, own: draw_start(k, own, sim.start()))(keys, own)
+            whole_way = jnp.broadcast_to(share >= 1, (n,))
+            x0 = select_lanes(whole_way, moved, x0)
+            points = select_lanes(
+                whole_way,
+                jax.vmap(partial(start_point, sim, reward), axis_size=plan.lanes)(x0),
+                points,
+            )
+        until = jnp.where(live, sim.horizon, 0)
+        ends, new, xs, _ = continue_runs(sim, reward, keys, points, until, draw, own, sim.horizon)
+        played = played_runs(sim, reward, x0, mine[0].rows, points, ends, new, xs)
+        mark = jax.vmap(partial(features, sim))(ends.progress.state)
+        best = best.merge(played, live, number, mark)
+        more = _tally(played, new, live, number)
+        more = more._replace(steps=more.steps + jnp.sum(steps, dtype=jnp.int32))
+        tally = tally.add(more)
+        return (best, _bettered(traces, played, live)), tally
+
+    return _blocks(block, plan, begin, end, (best, traces))
+
+
+def _rows_of(way, a):
+    """The rows ``way`` [m] of ``a`` [T, N, ...], one after another: [m N, ...]."""
+    return a[way].reshape(len(way) * a.shape[1], *a.shape[2:])
+
+
+def _copied(key, t, rows, dist):
+    return jax.tree.map(lambda a: a[t], rows)
+
+
+def _blocks(block, plan, begin, end, carry):
+    """``carry, tally`` after ``block(at, (carry, tally))`` for each block of lanes."""
+    _, carry, tally = lax.while_loop(
+        lambda c: (c[0] < end) & (c[0] >= begin),
+        lambda c: (c[0] + plan.lanes, *block(c[0], c[1:])),
+        (begin, carry, Tally.none()),
+    )
+    return carry, tally
+
+
+def _lanes(key, plan, at, begin, end):
+    """The numbers of the runs from ``at`` on, which of them are live, and their keys."""
+    number = at + jnp.arange(plan.lanes, dtype=jnp.int32)
+    live = (number < end) & (number >= begin)
+    return number, live, jax.vmap(jax.random.fold_in, (None, 0))(key, number)
+
+
+def _noise(sim, keys):
+    """How each run draws, and three more uniform numbers of it."""
+    real = outline(sim).dtype
+    u = jax.vmap(lambda k: jax.random.uniform(jax.random.fold_in(k, COINS), (5,), real))(keys)
+    widths, shares = jnp.asarray(WIDTHS, real), jnp.asarray(PERSISTING, real)
+    width = widths[(u[:, 3] * len(WIDTHS)).astype(jnp.int32)]
+    return Noise(width, shares[(u[:, 4] * len(PERSISTING)).astype(jnp.int32)]), u[:, :3]
+
+
+def _ways(sim, keys, traces, back):
+    """How each run follows its trace from step ``back`` on: a `Follow`."""
+    real = outline(sim).dtype
+    u = jax.vmap(lambda k: jax.random.uniform(jax.random.fold_in(k, COINS), (5,), real))(keys)
+    steps = jnp.maximum(traces.length - back, 1).astype(real)
+    rate = jnp.where(u[:, 0] < 0.3, 1.0, steps ** -u[:, 1]).astype(real)
+    change = (u[:, 2] * len(CHANGES)).astype(jnp.int32)
+    size = 10 ** (-3 * u[:, 3])
+    noise = Noise(0.5 + u[:, 4], jnp.zeros_like(size))
+    return Follow(
+        noise=noise,
+        rows=traces.rows,
+        x0=traces.x0,
+        length=traces.length,
+        rate=rate,
+        change=change,
+        size=size,
+    )
+
+
+def _bettered(traces, played, live):
+    """Each of the P traces, or the likeliest failure of its lanes (k, k + P, ..) if likelier."""
+    p, e = traces.length.shape[0], played.episode
+    value = jnp.where(e.failure & live, e.reward, -jnp.inf).reshape(-1, p)
+    row = jnp.argmax(value, axis=0) * p + jnp.arange(p)
+    new = Traces(e.x0, e.disturbances, e.length, e.reward)
+    new = jax.tree.map(lambda a: a[row], new)
+    return select_lanes(jnp.max(value, axis=0) > traces.reward, new, traces)
+
+
+def _tally(played, new, live, number):
+    """The `Tally` of runs of so many new steps."""
+    e = played.episode._replace(length=new)
+    return Tally.of(played._replace(episode=e), live, number)

@@ -1,0 +1,1 @@
+"""From failures to the likeliest of each mode."""

@@ -1,0 +1,122 @@
+"""A search's reward and actions as it takes them: checked, with the scales that they were not
+told, and named for the result.
+"""
+
+from dataclasses import fields, is_dataclass, replace
+from typing import Any, NamedTuple
+
+import jax
+
+from jast._src.core import actions as choices
+from jast._src.core import rewards
+from jast._src.core.check import ACTIONS, contract
+from jast._src.core.signature import outline
+from jast._src.core.simulator import Simulator
+from jast._src.runtime._jax import is_traced, is_tracing
+from jast._src.search.calibration import Calibration, calibrate
+from jast._src.util.checks import check_random_key
+from jast._src.util.display import call_settings
+
+__all__ = ["Ready", "default_actions", "prepare"]
+
+
+class Ready(NamedTuple):
+    """What a search starts with."""
+
+    reward: Any
+    """A pytree."""
+    actions: Any
+    settings: dict | None
+    """With names and seed; None if traced."""
+    calibration: Calibration | None
+    """The episodes that gave the scales; None where all were given."""
+
+
+def default_actions(function: str, sim: Simulator) -> choices.Wide | choices.Samples:
+    """`jast.actions.wide` where a disturbance has a quantile function, else `samples`; ValueError
+    where the simulator breaks its contract.
+    """
+    contract(function, sim)
+    return choices.wide() if outline(sim).disturbance.quantile else choices.samples()
+
+
+def prepare(
+    function: str,
+    key: jax.Array,
+    sim: Simulator,
+    reward: Any,
+    actions: Any,
+    *,
+    widen: str = "always",
+    **settings: Any,
+) -> Ready:
+    """The `Ready` of a search by the name ``function``, of its arguments and other ``settings``;
+    ``widen`` of `search.calibration.calibrate`. ValueError unless `contract` holds.
+    """
+    check_random_key(function, key)
+    contract(function, sim, actions)
+    reward = rewards.lexicographic() if reward is None else reward
+    reward, actions, calibration = _scaled(sim, reward, actions, widen)
+    reward = rewards.as_pytree(reward)
+    if is_traced(key, sim, reward, actions, settings) or is_tracing():
+        return Ready(reward, actions, None, calibration)
+    func = getattr(reward, "func", reward)
+    name = getattr(func, "__name__", None) or f"rewards.{type(func).__name__.lower()}"
+    settings = call_settings(function, key, **settings) | dict(
+        reward=name,
+        reward_settings=_settings(reward),
+        actions=ACTIONS.get(type(actions), type(actions).__name__),
+        action_settings=_settings(actions),
+    )
+    return Ready(reward, actions, settings, calibration)
+
+
+def _scaled(
+    sim: Simulator, reward: Any, actions: Any, widen: str
+) -> tuple[Any, Any, Calibration | None]:
+    """Reward and actions with the scales that they lack, and the episodes that gave these."""
+    bare = isinstance(reward, rewards.Lexicographic) and not reward.scaled
+    wide = isinstance(actions, choices.Wide) and actions.width is None
+    if not (bare or wide):
+        return reward, actions, None
+    about, widen = outline(sim), widen if wide else "never"
+    given = getattr(reward, "density", None) if bare else "raw"
+    density = given or about.density
+    calibration = calibrate(sim, density, widen)
+    told = calibration.near, calibration.rare, calibration.likely, calibration.width
+    if not is_traced(told):
+        if given is None and 2 * int(calibration.tally.invalid) > int(calibration.tally.episodes):
+            # a mode of infinite density, as of a gamma distribution of shape below 1
+            density, calibration = "raw", calibrate(sim, "raw", widen)
+            told = calibration.near, calibration.rare, calibration.likely, calibration.width
+        told = [float(v) for v in jax.device_get(told)]
+    near, rare, likely, width = told
+    if bare:
+        reward = replace(
+            reward,
+            near=near if reward.near is None else reward.near,
+            rare=rare if reward.rare is None else reward.rare,
+            likely=likely if reward.rare is None and density == "raw" else reward.likely,
+            density=density,
+        )
+    return reward, replace(actions, width=width) if wide else actions, calibration
+
+
+def _settings(part: Any) -> dict[str, Any]:
+    """The numbers and texts of a reward or of actions, as JSON can hold them."""
+    if is_dataclass(part):
+        given = {f.name: getattr(part, f.name) for f in fields(part)}
+    else:
+        args = getattr(part, "args", ())
+        given = dict(getattr(part, "keywords", {})) | ({"args": args} if args else {})
+    return {name: _plain(value) for name, value in given.items()}
+
+
+def _plain(value: Any) -> Any:
+    if value is None or isinstance(value, bool | int | float | str):
+        return value
+    if isinstance(value, tuple | list):
+        return [_plain(v) for v in value]
+    if isinstance(value, dict):
+        return {str(k): _plain(v) for k, v in value.items()}
+    return value.tolist() if hasattr(value, "tolist") else repr(value)

@@ -1,0 +1,105 @@
+"""How a tree search draws its actions: independently, as published, or spread out and partly near
+the mode of the disturbance.
+"""
+
+import math
+from dataclasses import dataclass, field
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from jast import distributions as D
+from jast._src.core.counter_prng import coin
+
+__all__ = ["Choice"]
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Choice:
+    """A search's `jast.actions` and how it draws them.
+
+    ``spread``: the children of a node are points of a low-discrepancy sequence (the additive
+    recurrence with the generalised golden ratio, shifted at random for each node) where the actions
+    are points of a cube, so that a few children cover it. ``focus``: every second child is ``mode +
+    focus (x - mode)``, with the mode of the disturbance: below 1 likelier and in finer steps, above
+    1 in the tails; so are half of the rollout steps of half of the trees, because there it helps on
+    some systems and hurts on others. Off where the disturbance has no mode or is all integers.
+
+    ``follow``: as soon as an episode is the best of its tree, the next simulations put its
+    disturbances into the tree, one a simulation, so that it can be varied from any of its steps.
+    ``feed``: with half of the steps to go, a rollout takes what the best episode took there (thesis
+    Algorithm 9). ``urgent``: a child that was never visited comes before all others (thesis
+    Algorithm 10); else it has Q = 0 (MCFS-AP eq. 3).
+    """
+
+    actions: Any
+    focus: Any
+    spread: bool = field(default=True, metadata=dict(static=True))
+    focused: bool = field(default=True, metadata=dict(static=True))
+    follow: bool = field(default=False, metadata=dict(static=True))
+    feed: bool = field(default=False, metadata=dict(static=True))
+    urgent: bool = field(default=False, metadata=dict(static=True))
+
+    def child(self, key, slot, dist, start=False):
+        """The action of a node's child by the node's key and the child's place among its siblings;
+        ``start``: it is an x0.
+        """
+        kinds = 2 if self._can_focus(dist) else 1
+        place = (
+            None
+            if start and not self.actions.places_start
+            else getattr(self.actions, "place", None)
+        )
+        if self.spread and place is not None:
+            x = place(_point(key, slot // kinds, D.event_like(dist)), dist)
+        else:
+            x = (self.actions.draw_start if start else self.actions.draw)(
+                jax.random.fold_in(key, slot), dist
+            )
+        return self._near(slot % 2 == 1, x, dist, start) if kinds == 2 else x
+
+    def roll(self, key, tree_key, dist, start=False):
+        """An action of a rollout, by its own key and its tree's."""
+        x = (self.actions.draw_start if start else self.actions.draw)(key, dist)
+        return (
+            self._near(coin(key) & coin(tree_key), x, dist, start) if self._can_focus(dist) else x
+        )
+
+    def _can_focus(self, dist):
+        floats = [
+            jnp.issubdtype(s.dtype, jnp.floating) for s in jax.tree.leaves(D.event_like(dist))
+        ]
+        return self.focused and any(floats) and D.has_mode(dist)
+
+    def _near(self, pred, x, dist, start):
+        near = self.actions.near(x, dist, self.focus, start)
+        return jax.tree.map(lambda a, b: jnp.where(pred, a, b), near, x)
+
+
+def _point(key, index, event):
+    """The point of a node's sequence with this number, in the unit cube of ``event``'s shape: R_d,
+    x_n = frac(shift + n / phi_d^j), j = 1 .. d.
+    """
+    leaves, treedef = jax.tree.flatten(event)
+    dimension = sum(math.prod(s.shape) for s in leaves)
+    phi = 2.0
+    for _ in range(60):  # the positive root of phi^(d + 1) = phi + 1
+        phi = (1 + phi) ** (1 / (dimension + 1))
+    # steps in 32-bit fixed point: exact for any number of children
+    steps = jnp.asarray(
+        [int(phi ** -(j + 1) * 2**32) & 0xFFFFFFFF for j in range(dimension)], jnp.uint32
+    )
+    words = jax.random.bits(key, (dimension,), jnp.uint32) + steps * index.astype(jnp.uint32)
+    out, at = [], 0
+    for s in leaves:
+        n = math.prod(s.shape)
+        dtype = D.float_dtype(s.dtype)
+        out.append(
+            ((words[at : at + n] >> 8).astype(dtype) * jnp.asarray(2.0**-24, dtype)).reshape(
+                s.shape
+            )
+        )
+        at += n
+    return treedef.unflatten(out)

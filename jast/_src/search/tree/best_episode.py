@@ -1,0 +1,128 @@
+"""What a tree does with the best episode that it has seen: grow that episode's path, or feed its
+action to later rollouts.
+"""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from jast._src.core.signature import outline
+from jast._src.core.simulator import Simulator
+from jast._src.search.tree.packing import pack, shapes, unpack, width
+
+__all__ = [
+    "Lead",
+    "feed_level",
+    "fed_of",
+    "take_fed",
+    "follows",
+    "no_lead",
+    "update_lead",
+    "packed",
+]
+
+
+class Lead(NamedTuple):
+    """The best episode of each of B trees; with ``follow``, the best failure. Without it ``on`` to
+    ``path`` are ``()``, without ``feed`` ``fed`` is.
+    """
+
+    value: jax.Array
+    """[B] float: its reward; -inf before there is one."""
+    source: jax.Array
+    """[B] int32: 1 + its simulation."""
+    on: Any
+    """[B] bool: the next simulation goes straight to ``node`` and takes there what the best episode
+    took.
+    """
+    node: Any
+    """[B] int32: the last node on the path of that episode."""
+    depth: Any
+    """[B] int32: its level."""
+    reward: Any
+    """[B] float: from the start up to it."""
+    trail: Any
+    """[H + 1, B] int32: nodes from the first root to it."""
+    path: Any
+    """[H, B] int32: edges to it, as places in the tree's edges."""
+    fed: Any
+    """[S + 1, B, words] uint32: what the rollout of each simulation is fed: whether there is
+    anything, and the packed disturbance.
+    """
+
+
+def no_lead(problem, lanes, levels, simulations, dtype):
+    """The `Lead` of trees that have seen nothing, or ``()`` where the search wants none."""
+    follow, feed = problem.choice.follow, problem.choice.feed
+    if not (follow or feed):
+        return ()
+    zero, low = jnp.zeros((lanes,), jnp.int32), jnp.full((lanes,), -jnp.inf, dtype)
+    trail = jnp.zeros((levels + 1, lanes), jnp.int32)
+    path = zero > 0, zero, zero, jnp.zeros_like(low), trail, trail[:-1]
+    words = 1 + width(_like(problem.sim))
+    fed = jnp.zeros((simulations + 1, lanes, words), jnp.uint32) if feed else ()
+    return Lead(low, zero, *(path if follow else ((),) * 6), fed)
+
+
+def follows(tree):
+    """Whether nodes may have taken their action from the best episode."""
+    return isinstance(tree.lead, Lead) and not isinstance(tree.lead.on, tuple)
+
+
+def feed_level(sim: Simulator) -> int:
+    """The level at which floor(horizon / 2) steps remain (thesis Algorithm 9)."""
+    return sim.horizon - sim.horizon // 2 + outline(sim).random_start
+
+
+def fed_of(tree, simulation, lane):
+    """What the rollouts of these simulations were fed, [..., words]; ``()`` where nothing ever
+    is.
+    """
+    fed = tree.lead.fed if isinstance(tree.lead, Lead) else ()
+    return fed if isinstance(fed, tuple) else fed[simulation, lane]
+
+
+def take_fed(sim, words, here, x):
+    """One lane: the disturbance that is fed, where there is one and ``here``; else ``x``."""
+    there = here & (words[0] > 0)
+    return jax.tree.map(lambda a, b: jnp.where(there, a, b), unpack(words[1:], _like(sim)), x)
+
+
+def update_lead(tree, walk, fresh, child, value, failed, i, middle):
+    """The `Lead` after simulation ``i``, whose episodes earned ``value`` [B]; ``middle`` [B,
+    words]: what their rollouts took at `feed_level`.
+    """
+    lead = tree.lead
+    better = fresh & jnp.isfinite(value) & (value > lead.value)
+    # of failures only: following every better miss costs more finds than it brings
+    if follows(tree):
+        better &= failed
+    if follows(tree):
+        moves = fresh & (better | lead.on)
+        lane, new = jnp.arange(len(value), dtype=jnp.int32), jnp.zeros_like(lead.node) + i + 1
+        lead = lead._replace(
+            on=moves & ~child.done,
+            node=jnp.where(moves, new, lead.node),
+            depth=jnp.where(moves, walk.depth + 1, lead.depth),
+            reward=jnp.where(moves, child.reward, lead.reward),
+            trail=jnp.where(moves[None], walk.trail.at[walk.depth + 1, lane].set(new), lead.trail),
+            path=jnp.where(moves[None], walk.path, lead.path),
+        )
+    if not isinstance(lead.fed, tuple):
+        # thesis Algorithm 9: a* after this rollout
+        row = jnp.where((better & (middle[:, 0] > 0))[:, None], middle, lead.fed[i])
+        lead = lead._replace(fed=jax.lax.dynamic_update_slice_in_dim(lead.fed, row[None], i + 1, 0))
+    return lead._replace(
+        value=jnp.where(better, value, lead.value),
+        source=jnp.where(better, jnp.zeros_like(lead.source) + i + 1, lead.source),
+    )
+
+
+def packed(there, x):
+    """One lane: a row of ``Lead.fed``."""
+    return jnp.concatenate([there.astype(jnp.uint32)[None], pack(x)])
+
+
+def _like(sim: Simulator) -> Any:
+    return shapes(outline(sim).x)

@@ -1,0 +1,112 @@
+"""The value term of eq. 3: v(s, a) of a child, evaluated once, when the child appears, and kept in
+the tree.
+"""
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+
+from jast._src.search.tree.head_guidance import child_value
+from jast._src.search.tree.layout import (
+    LINK,
+    PAGE,
+    ROW,
+    choose_child,
+    levels,
+    node_keys,
+    node_shapes,
+    of_lanes,
+)
+from jast._src.search.tree.packing import unpack
+
+__all__ = ["evaluate_children"]
+
+
+def evaluate_children(problem, axes, tree, walk, fresh, replay, memoize):
+    """Give children their v(s, a) before a selection sees them, and pages to stand on: the tree.
+
+    With ``guide.eager``, of every node of the path the child that its next visit will find; else of
+    the node that has a new child, ``fresh`` [B], the one that comes after it. A first child needs
+    no value before it has a sibling: both come at once then. They are put in a row and evaluated
+    together, two a tree at a time. ``replay(lane, level, live)`` [m]: states of the path's nodes
+    where they are not kept, and the steps to get there.
+    """
+    lanes = tree.key.shape[0]
+    lane, nowhere = jnp.arange(lanes, dtype=jnp.int32), tree.edges.size
+    like = node_shapes(tree, memoize)
+    if problem.guide.eager:
+        depth = jnp.broadcast_to(
+            jnp.arange(walk.new.shape[0], dtype=jnp.int32)[:, None], walk.new.shape
+        )
+        todo = (
+            (tree.alive & ~tree.ended)[None]
+            & (walk.new > 0)
+            & (depth >= tree.depth[None])
+            & (depth <= walk.depth[None])
+        )
+        new, last = walk.new, walk.last
+    else:
+        depth, todo, new, last = (
+            a[None] for a in (walk.depth, fresh, walk.best.slot + 1, walk.best.edge // ROW)
+        )
+
+    opens = todo & (new % PAGE == 0)  # a page of its own
+    rank = jnp.cumsum(opens, axis=0, dtype=jnp.int32)
+    page = tree.pages[None] + rank - 1
+    rows = jnp.where(opens, page * lanes + lane[None], last)
+
+    # the new child, and the first one where the new one is its first sibling
+    both = jnp.concatenate([todo, todo & (new == 1)])
+    per_lane = jnp.sum(both, axis=0, dtype=jnp.int32)
+    place = (
+        jnp.cumsum(both, axis=0, dtype=jnp.int32)
+        - 1
+        + (jnp.cumsum(per_lane, dtype=jnp.int32) - per_lane)[None]
+    )
+    place = jnp.where(both, place, -1).reshape(-1)
+    number, room = jnp.arange(place.size, dtype=jnp.int32), 2 * lanes
+    total = jnp.sum(per_lane, dtype=jnp.int32)
+
+    def some(carry):
+        done, edges, values, steps = carry
+        here = (place >= done) & (place < done + room)
+        entry = (
+            jnp.zeros((room,), jnp.int32)
+            .at[jnp.where(here, place - done, room)]
+            .set(number, mode="drop")
+        )
+        live = jnp.arange(room, dtype=jnp.int32) < total - done
+        at = entry // lanes % len(new), entry % lanes
+        level, column = depth[at], at[1]
+        slot = jnp.where(entry >= new.size, 0, new[at])
+        node, row = walk.trail[level, column], rows[at]
+        if memoize == "node":
+            state = jax.vmap(lambda w: unpack(w, like).state)(tree.nodes[node, column])
+        else:
+            state, taken = replay(column, level, live)
+            steps = steps.at[jnp.where(live, column, lanes)].add(taken, mode="drop")
+        v = jax.vmap(_value, in_axes=(axes, 0, 0, 0))(
+            of_lanes(problem, axes, column), node_keys(tree.key[column], node), slot, state
+        )
+        # the level of a random start has no value: all its children score 0
+        v = jnp.where(level < levels(problem.sim) - problem.sim.horizon, 0, v).astype(values.dtype)
+        values = values.at[jnp.where(live, row * (PAGE + 1) + slot % PAGE, nowhere)].set(
+            v, mode="drop"
+        )
+        link = jnp.where(live & opens[at], last[at] * ROW + LINK, nowhere)
+        return (
+            done + room,
+            edges.at[link].add(page[at].astype(edges.dtype), mode="drop"),
+            values,
+            steps,
+        )
+
+    _, edges, values, steps = lax.while_loop(
+        lambda c: c[0] < total, some, (jnp.int32(0), tree.edges, tree.values, tree.steps)
+    )
+    return tree._replace(edges=edges, values=values, pages=tree.pages + rank[-1], steps=steps)
+
+
+def _value(problem, node_key, slot, state):
+    _, x = choose_child(problem, node_key, slot, state)
+    return child_value(problem.guide, problem.sim, state, x)

@@ -1,0 +1,170 @@
+"""All edges of finished trees: as samples for a value head (the published training set), and as
+they stand, to be looked at.
+"""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+
+from jast._src.core.signature import outline
+from jast._src.distributions.flat_rows import flat
+from jast._src.heads.heads import observation
+from jast._src.search.tree.best_episode import fed_of
+from jast._src.search.tree.layout import (
+    CHILD,
+    FAILURE,
+    FRESH,
+    LINK,
+    PAGE,
+    RETURNS,
+    ROW,
+    VISITS,
+    choose,
+    choose_child,
+    levels,
+    node_keys,
+    node_shapes,
+)
+from jast._src.search.tree.packing import unpack
+from jast._src.util import display
+
+__all__ = ["Branches", "Edges", "branches_of", "edges_of"]
+
+
+class Edges(NamedTuple):
+    """The edges (s, a) of B trees of S simulations; the one of row i was first taken by simulation
+    i.
+    """
+
+    seen: Any
+    """[S, B, n] what networks see of s."""
+    x: Any
+    """[S, B, d] the disturbance."""
+    visits: Any
+    """[S, B] N(s, a)."""
+    q: Any
+    """[S, B] Q(s, a)."""
+    parent_q: Any
+    """[S, B] Q of the edge that leads to s, 0 at the first root: the published target."""
+    valid: Any
+    """[S, B] bool: there is such an edge."""
+
+
+def edges_of(problem, tree, children, axes=None):
+    """The `Edges` of trees that keep states at every node; ``children``: the greatest number of a
+    node.
+    """
+    node, _, visits, q, valid = _numbers(problem, tree, children)
+    parent, slot = node.parent[1:], node.slot[1:]
+    parent_q = jnp.take_along_axis(jnp.concatenate([jnp.zeros_like(q[:1]), q]), parent, axis=0)
+
+    def one(problem, keys, states, parent, slot):
+        """A tree's, [S, ...]."""
+
+        def edge(parent, slot):
+            state = jax.tree.map(lambda a: a[parent], states)
+            return observation(problem.sim, state), flat(
+                choose_child(problem, node_keys(keys[None], parent[None])[0], slot, state)[1]
+            )
+
+        return jax.vmap(edge)(parent, slot)
+
+    seen, x = jax.vmap(one, in_axes=(axes, 0, 1, 1, 1), out_axes=1)(
+        problem, tree.key, node.state, parent, slot
+    )
+    if outline(problem.sim).random_start:  # the first level chooses x0
+        valid = valid & (parent > 0)
+    return Edges(seen, x, visits.astype(jnp.int32), q, parent_q, valid)
+
+
+@display.printable()
+class Branches(NamedTuple):
+    """B trees of up to S nodes beside their first roots. Row i is the node that simulation i made,
+    number i + 1, and the edge that leads to it; the first root has number 0.
+    """
+
+    parent: Any
+    """[S, B] int32: the number of the node that it is a child of."""
+    start: Any
+    """[S, B, ...] its x0, which is the choice at the first root of a system with a random start;
+    ``()`` for one start.
+    """
+    x: Any
+    """[S, B, ...] its disturbance; at the first root of a random start it means nothing."""
+    visits: Any
+    """[S, B] int32: N(s, a), 0 where there is no such node."""
+    q: Any
+    """[S, B] float: Q(s, a)."""
+    end: Any
+    """[S, B] bool: an episode ends there."""
+    distance: Any
+    """[S, B] float: miss distance up to there."""
+    reward: Any
+    """[S, B] float: of the episode of the simulation that made it."""
+    failure: Any
+    """[S, B] bool: that episode failed."""
+
+
+def branches_of(problem, tree, children, axes=None):
+    """The `Branches` of trees that keep states at every node; ``children`` as for `edges_of`."""
+    node, child, visits, q, valid = _numbers(problem, tree, children)
+    parent, slot = node.parent[1:], node.slot[1:]
+    lane = jnp.arange(tree.key.shape[0], dtype=jnp.int32)
+    level, source, fed = jnp.zeros_like(parent), (), ()
+    if problem.choice.follow:
+
+        def up(_, at):
+            above, level = at
+            return jnp.take_along_axis(node.parent, above, axis=0), level + jnp.sign(above)
+
+        _, level = lax.fori_loop(0, levels(problem.sim), up, (parent, level))
+        source = node.source[1:]
+        fed = fed_of(tree, jnp.maximum(source - 1, 0), lane[None])
+
+    def one(problem, key, states, *of):
+        """A tree's, [S, ...]."""
+
+        def edge(parent, slot, level, source, fed):
+            state = jax.tree.map(lambda a: a[parent], states)
+            return choose(problem, key, parent, slot, level, state, source, fed)
+
+        return jax.vmap(edge)(*of)
+
+    start, x = jax.vmap(one, in_axes=(axes, 0, *[1] * 6), out_axes=1)(
+        problem, tree.key, node.state, parent, slot, level, source, fed
+    )
+    return Branches(
+        parent,
+        start,
+        x,
+        jnp.where(valid, visits, 0).astype(jnp.int32),
+        q,
+        valid & (child < 0),
+        node.distance[1:],
+        tree.log,
+        (tree.outcome & FAILURE) > 0,
+    )
+
+
+def _numbers(problem, tree, children):
+    """The nodes [S + 1, B], and of the edge that leads to each but the first root [S, B]: the
+    child's id, visits, Q, and whether there is such an edge.
+    """
+    lanes = tree.key.shape[0]
+    lane = jnp.arange(lanes, dtype=jnp.int32)[None]
+    like = node_shapes(tree, "node")
+    node = jax.vmap(jax.vmap(lambda w: unpack(w, like)))(tree.nodes)
+    parent, slot = node.parent[1:], node.slot[1:]
+    row = parent * lanes + lane
+    for hop in range(1, -(-children // PAGE)):
+        row = jnp.where(
+            slot >= hop * PAGE, tree.edges[row * ROW + LINK].astype(jnp.int32) * lanes + lane, row
+        )
+    at = row * ROW + slot % PAGE
+    visits, total = tree.edges[at + VISITS], tree.edges[at + RETURNS]
+    own = jnp.take_along_axis(node.reward, parent, axis=0)  # up to s
+    valid = ((tree.outcome & FRESH) > 0) & ~tree.ended[None] & (visits > 0)
+    q = jnp.where(valid, problem.q_value(total, visits, own), 0)
+    return node, tree.edges[at + CHILD], visits, q, valid

@@ -1,0 +1,80 @@
+"""How a search uses its heads: rollout steps drawn from the policy head's histogram, and the value
+term of eq. 3.
+"""
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from jast import distributions as D
+from jast._src.distributions.flat_rows import flat, unflat
+from jast._src.heads.heads import observation, policy_logits, predicted_value, sample_bins
+
+__all__ = ["Guide", "child_value", "guide", "rolled"]
+
+
+_SHARE = jnp.uint32(1 << 31)
+"""Address apart from those of levels."""
+_HEAD = jnp.uint32(1)
+"""Address apart from that of what is drawn without heads."""
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Guide:
+    """Heads in a search; the numbers are traced."""
+
+    heads: Any
+    """`jast.heads.Heads`."""
+    power: Any
+    """A bin is drawn with probability proportional to p^power."""
+    q_weight: Any
+    """Of Q(s, a) where there is a value head."""
+    v_weight: Any
+    """c2 of MCFS-AP eq. 3."""
+    share: Any
+    """Of the rollouts that the policy head draws."""
+    levels: Any
+    """The first levels of an episode, at which the policy head draws."""
+    eager: bool = field(default=False, metadata=dict(static=True))
+    """Whether a node's unvisited children are all that widening allows, or one at a time."""
+
+
+def guide(heads, settings):
+    """The `Guide` by ``heads`` (of `jast.heads`) and their settings; one without influence where
+    they were never trained and may not guide so.
+    """
+    levels = jnp.where(settings.from_start, 2**30, jnp.asarray(heads.levels, jnp.int32))
+    trained = levels > 0
+    made = Guide(
+        heads,
+        power=jnp.float32(settings.power),
+        q_weight=jnp.where(trained, jnp.float32(settings.q_weight), jnp.float32(1)),
+        v_weight=jnp.where(trained, jnp.float32(settings.v_weight), jnp.float32(0)),
+        share=jnp.float32(settings.share),
+        levels=levels,
+        eager=settings.candidates == "all",
+    )
+    return jax.tree.map(jnp.asarray, made)
+
+
+def rolled(guide, sim, actions, simulation, key, level, state, dist, otherwise):
+    """A rollout's disturbance by the policy head; ``otherwise`` at levels that it has learned
+    nothing of, and in the simulations that are not its share.
+    """
+    logits = guide.power * policy_logits(guide.heads, observation(sim, state))
+    own = jax.random.uniform(jax.random.fold_in(simulation, _SHARE), (), jnp.float32) < guide.share
+    key = jax.random.fold_in(key, _HEAD)
+    u = jax.random.uniform(key, logits.shape[:1], jnp.float32)
+    x = actions.at(unflat(sample_bins(logits, u), D.event_like(dist)), dist)
+    return jax.tree.map(
+        lambda a, b: jnp.where(own & (level < guide.levels), a.astype(b.dtype), b), x, otherwise
+    )
+
+
+def child_value(guide, sim, state, x):
+    """v(s, a); 0 where it is not finite."""
+    v = predicted_value(guide.heads, observation(sim, state), flat(x))
+    return jnp.where(jnp.isfinite(v), v, 0)

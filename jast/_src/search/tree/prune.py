@@ -1,0 +1,179 @@
+"""Action pruning (MCFS-AP A1): the robust child becomes the root, its subtree stays, and the old
+root's statistics are kept for training.
+"""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+
+from jast._src.search.lanes import select_lanes
+from jast._src.search.tree.best_episode import fed_of, follows
+from jast._src.search.tree.layout import (
+    CHILD,
+    LINK,
+    PAGE,
+    RETURNS,
+    REWARD,
+    ROW,
+    VISITS,
+    choose,
+    node_shapes,
+)
+from jast._src.search.tree.packing import unpack
+from jast._src.search.tree.simulate import child_state, replay_to
+from jast._src.util import display
+
+__all__ = ["Roots", "prune", "recounted"]
+
+
+@display.printable()
+class Roots(NamedTuple):
+    """What is known of B roots at the end of their turn: K is the greatest number of children."""
+
+    state: Any
+    """[B, ...] the simulator's state at the root."""
+    depth: jax.Array
+    """[B] int32: levels above the root."""
+    actions: Any
+    """[B, K, ...] the disturbances x of the children."""
+    starts: Any
+    """[B, K, ...] the x0 of the children, which are the choices at depth 0 of a random start;
+    ``()`` for a system with one start.
+    """
+    visits: jax.Array
+    """[B, K] int32: 0 where there is no such child."""
+    q: jax.Array
+    """[B, K] float: mean reward from the root on, the child's own step included."""
+    valid: jax.Array
+    """[B] bool: the tree was searching from this root."""
+
+
+def prune(problem, tree, children, memoize="node", axes=None):
+    """Make the most visited child of each root the root (ties: the first made): the tree and the
+    old roots' `Roots`.
+
+    ``children``: the greatest number of children a node can have, static. A tree whose new root is
+    an episode's end is at its end.
+    """
+    root, level = tree.root, tree.depth
+    searching = tree.alive & ~tree.ended
+    state = _root_state(problem, axes, tree, memoize)
+    tree = _add_turn(tree)
+    rows, visits, total, child, reward = _children(tree, children)
+    q = problem.q_value(total, visits, tree.root_reward[:, None])
+
+    slots, lane = jnp.arange(children, dtype=jnp.int32), jnp.arange(len(root), dtype=jnp.int32)
+    source, fed = (), ()
+    if follows(tree):
+        like = node_shapes(tree, memoize)
+        known = jax.vmap(jax.vmap(lambda w: unpack(w, like).source))(
+            tree.nodes[jnp.abs(child).astype(jnp.int32), lane[:, None]]
+        )
+        source = jnp.where(visits > 0, known, 0)
+        fed = fed_of(tree, jnp.maximum(source - 1, 0), lane[:, None])
+
+    def draw(p, key, root, level, state, *of):
+        return jax.vmap(lambda slot, *of: choose(p, key, root, slot, level, state, *of))(slots, *of)
+
+    starts, actions = jax.vmap(draw, in_axes=(axes, 0, 0, 0, 0, 0, 0))(
+        problem, tree.key, root, level, state, source, fed
+    )
+    roots = Roots(state, level, actions, starts, visits.astype(jnp.int32), q, searching)
+
+    slot = jnp.argmax(visits, axis=1).astype(jnp.int32)
+    n, to, reward = (_pick(a, slot) for a in (visits, child, reward))
+    move = searching & (n > 0)
+    new = jnp.where(move, jnp.abs(to).astype(jnp.int32), root)
+    place = jnp.arange(tree.trail.shape[0], dtype=jnp.int32)[:, None]
+    edge = _pick(rows, slot // PAGE) * ROW + slot % PAGE
+    tree = tree._replace(
+        path=jnp.where(move[None] & (place[:-1] == level[None]), edge[None], tree.path),
+        trail=jnp.where(move[None] & (place == level[None] + 1), new[None], tree.trail),
+        root=new,
+        root_visits=jnp.where(move, n.astype(jnp.int32), tree.root_visits),
+        root_reward=jnp.where(move, reward, tree.root_reward),
+        depth=level + move.astype(jnp.int32),
+        alive=tree.alive & move & (to > 0),
+    )
+    if follows(tree):  # what is known of another branch says nothing of this one
+        lead, keep = tree.lead, _pick(tree.lead.trail.T, level + 1) == new
+        tree = tree._replace(
+            lead=lead._replace(on=lead.on & keep, value=jnp.where(keep, lead.value, -jnp.inf))
+        )
+    if memoize == "root":
+        of = jax.tree.map(lambda a: jax.vmap(lambda row, j: row[j])(a, slot), (source, fed))
+        after = jax.vmap(child_state, in_axes=(axes, 0, 0, 0, 0, 0, 0, 0))(
+            problem, tree.key, root, slot, level, state, *of
+        )
+        tree = tree._replace(base=select_lanes(move, after, state))
+    return tree, roots
+
+
+def recounted(problem, tree, roots, children, memoize="node"):
+    """`Roots` [turns, B] of a finished tree with the visits and means that their children have at
+    its end, when the simulations of later roots have gone through one child of each.
+    """
+    lane = jnp.arange(len(tree.root), dtype=jnp.int32)
+    like = node_shapes(tree, memoize)
+
+    def one(root):
+        node = tree.trail[root.depth, lane]
+        reward = jax.vmap(lambda w: unpack(w, like).reward)(tree.nodes[node, lane])
+        _, visits, total, *_ = _children(tree._replace(root=node), children)
+        q = problem.q_value(total, visits, reward[:, None])
+        count = jnp.where(root.valid[:, None], visits, 0).astype(jnp.int32)
+        return root._replace(visits=count, q=q)
+
+    return lax.map(one, roots)
+
+
+def _add_turn(tree):
+    """The visits and returns of this turn, added to the edges above the root: the backup of
+    Algorithm 1 goes to the first root.
+    """
+    place = jnp.arange(tree.path.shape[0], dtype=jnp.int32)[:, None]
+    at = jnp.where(place < tree.depth[None], tree.path, tree.edges.size)
+    places = jnp.stack([at + VISITS, at + RETURNS]).reshape(-1)
+    values = jnp.broadcast_to(tree.turn[:, None], (2, *at.shape)).reshape(-1)
+    return tree._replace(
+        edges=tree.edges.at[places].add(values, mode="drop"), turn=jnp.zeros_like(tree.turn)
+    )
+
+
+def _children(tree, children):
+    """Of each root's children: their pages' rows [B, pages], and [B, children] visits, returns, ids
+    and rewards; 0 where there is none.
+    """
+    (lanes,) = tree.key.shape
+    lane = jnp.arange(lanes, dtype=jnp.int32)
+    edges = tree.edges.reshape(-1, ROW)
+
+    def page(carry, _):
+        row, there = carry
+        record = jnp.where(there[:, None], edges[row], 0)
+        link = record[:, LINK].astype(jnp.int32)
+        return (jnp.where(link > 0, link * lanes + lane, row), there & (link > 0)), (row, record)
+
+    start = (tree.root * lanes + lane, jnp.ones((lanes,), bool))
+    _, (rows, records) = lax.scan(page, start, None, length=-(-children // PAGE))
+    columns = (
+        records[:, :, c : c + PAGE].swapaxes(0, 1).reshape(lanes, -1)[:, :children]
+        for c in (VISITS, RETURNS, CHILD, REWARD)
+    )
+    return rows.T, *columns
+
+
+def _root_state(problem, axes, tree, memoize):
+    if memoize == "node":
+        (lanes,) = tree.key.shape
+        like = node_shapes(tree, memoize)
+        return jax.vmap(lambda w: unpack(w, like).state)(tree.nodes[tree.root, jnp.arange(lanes)])
+    if memoize == "root":
+        return tree.base
+    return replay_to(problem, axes, tree, tree.trail, tree.depth, memoize)[0]
+
+
+def _pick(array, index):
+    return jnp.take_along_axis(array, index[:, None], axis=1)[:, 0]

@@ -1,0 +1,85 @@
+"""Episodes of a tree search, rebuilt from the number of their simulation: choices are addressed, so
+none has to be stored.
+"""
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+
+from jast._src.core.episode import Episode
+from jast._src.core.transition import blank
+from jast._src.search.tree.best_episode import fed_of
+from jast._src.search.tree.layout import (
+    FAILURE,
+    FRESH,
+    choose,
+    choose_rollout,
+    levels,
+    node_shapes,
+    of_lanes,
+    take,
+)
+from jast._src.search.tree.packing import unpack
+
+__all__ = ["rebuild"]
+
+
+def rebuild(problem, tree, lane, i, memoize="node", axes=None):
+    """The episode of simulation ``i`` [n] of tree ``lane`` [n]: an `Episode` [n, ...] with the
+    search's own reward, without states and true log p.
+
+    To be passed through `jast.replay`, which gives it its exact numbers.
+    """
+    return jax.vmap(lambda lane, i: _one(problem, axes, tree, lane, i, memoize))(lane, i)
+
+
+def _one(problem, axes, tree, lane, i, memoize):
+    problem = of_lanes(problem, axes, lane)
+    like, key, sim = node_shapes(tree, memoize), tree.key[lane], problem.sim
+    height = levels(sim)
+    outcome = tree.outcome[i, lane]
+    leaf = jnp.where(((outcome & FRESH) > 0) & ~tree.ended[lane], i + 1, 0)
+
+    def up(node, _):
+        record = unpack(tree.nodes[node, lane], like)
+        return record.parent, (node, record.parent, record.slot, record.source)
+
+    _, (nodes, parents, slots, sources) = lax.scan(up, leaf, None, length=height)
+    # choices made in the tree; those of the rollout follow
+    depth = jnp.sum(nodes > 0, dtype=jnp.int32)
+    rolling = jax.random.fold_in(key, i)
+    begin = jax.tree.map(lambda a: a[lane], tree.origin)
+
+    def down(at, level):
+        up_there = jnp.clip(depth - 1 - level, 0, height - 1)
+        source = jax.tree.map(lambda a: a[up_there], sources)
+        of = (
+            (source, fed_of(tree, jnp.maximum(source - 1, 0), lane))
+            if problem.choice.follow
+            else ()
+        )
+        chosen = choose(problem, key, parents[up_there], slots[up_there], level, at.state, *of)
+        rolled = choose_rollout(problem, rolling, key, level, at.state, fed_of(tree, i, lane))
+        x0, x = action = jax.tree.map(lambda a, b: jnp.where(level < depth, a, b), chosen, rolled)
+        after = take(problem, level, at, action)
+        kept = jax.tree.map(lambda a, b: jnp.where(at.done, a, b), at, after)
+        return kept, (
+            x0,
+            jax.tree.map(lambda a: jnp.where(at.done, jnp.zeros((), a.dtype), a), x),
+            ~at.done,
+        )
+
+    start = blank(sim, begin)._replace(done=tree.ended[lane])
+    end, (x0s, xs, lived) = lax.scan(down, start, jnp.arange(height, dtype=jnp.int32))
+    first = height - sim.horizon
+    x0 = jax.tree.map(lambda a: a[0], x0s)
+    steps = jnp.sum(lived[first:], dtype=jnp.int32)
+    return Episode(
+        x0,
+        jax.tree.map(lambda a: a[first:], xs),
+        end.log_prob,
+        end.distance,
+        (outcome & FAILURE) > 0,
+        steps,
+        tree.log[i, lane],
+    )

@@ -1,0 +1,225 @@
+"""Selection: from the root down to a child that was never visited, or to an episode's end."""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+
+from jast._src.search.tree.best_episode import follows
+from jast._src.search.tree.layout import CHILD, LINK, PAGE, RETURNS, REWARD, ROW, VISITS
+
+__all__ = ["Best", "Walk", "select"]
+
+
+class Best(NamedTuple):
+    """The best child of a node so far."""
+
+    score: jax.Array
+    edge: jax.Array
+    """Its place in the edges."""
+    slot: jax.Array
+    visits: jax.Array
+    child: jax.Array
+    """Node id; 0: never visited; negative: an episode's end."""
+    reward: jax.Array
+
+
+class Walk(NamedTuple):
+    """Where the selection of each tree stands: at a page of a node, with the best child so far."""
+
+    node: jax.Array
+    row: jax.Array
+    """The page's row in the edges."""
+    offset: jax.Array
+    """Slots in the pages before."""
+    count: jax.Array
+    """Children of the node."""
+    grows: jax.Array
+    """bool: it will have one more at its next visit."""
+    bonus: jax.Array
+    """Exploration weight times sqrt(ln N(s))."""
+    reward: jax.Array
+    """From the start up to the node."""
+    depth: jax.Array
+    best: Best
+    done: jax.Array
+    path: jax.Array
+    trail: jax.Array
+    desk: jax.Array
+    scores: jax.Array
+    below: jax.Array
+    values: Any
+    """Desk of the pages' v(s, a), ``()`` without a value head; so are the next two."""
+    last: Any
+    """[H, B] last page's row of the path's nodes."""
+    new: Any
+    """[H, B] the slot that will be new at the next visit, or 0 (the first child needs no value
+    while it is alone).
+    """
+
+
+def select(problem, tree):
+    """Walk down to a child that was never visited, or to an episode's end: MCFS-AP eq. 3 and
+    progressive widening, a page an iteration.
+    """
+    settings, guide, valued = problem.settings, problem.guide, problem.values
+    eager = valued and guide.eager
+    lanes = tree.key.shape[0]
+    lane = jnp.arange(lanes, dtype=jnp.int32)
+    edges, dtype = tree.edges, tree.edges.dtype
+    slots, columns = (
+        jnp.arange(PAGE + 1, dtype=jnp.int32)[None],
+        jnp.array([[CHILD, REWARD]], jnp.int32),
+    )
+    exploration = jnp.broadcast_to(jnp.asarray(settings.exploration, dtype), (lanes,))
+    nil = jnp.zeros((lanes,), jnp.int32)
+
+    # 0, which XLA does not know: an update of the whole desk would not be one in place
+    first = jnp.minimum(tree.depth[0], 0)
+
+    def of_node(visits):
+        def width(n):
+            return settings.widths[n if settings.widths.ndim == 1 else (lane, n)]
+
+        count = width(visits)
+        grows = width(visits + 1) > count if eager else ()
+        return count, grows, exploration * jnp.sqrt(jnp.log(visits.astype(dtype)))
+
+    def read(w):
+        """Visits and returns of the pages, laid out on the desk (see `Tree.desk`)."""
+        rows = edges.reshape(-1, CHILD)[w.row * (ROW // CHILD)]
+        desk = lax.dynamic_update_slice_in_dim(w.desk, rows[None], first, 0)
+        return desk, desk[0]
+
+    def number(a):  # of all trees or of each
+        return jnp.asarray(a, dtype).reshape(-1, 1)
+
+    def pick(row, column, j):
+        return jnp.take_along_axis(row, (column + j)[:, None], axis=1, mode="promise_in_bounds")[
+            :, 0
+        ]
+
+    def body(w):
+        desk, row = read(w)
+        n, total = row[:, VISITS:RETURNS], row[:, RETURNS:CHILD]
+        q = problem.q_value(total, n, w.reward[:, None])
+        if valued:
+            values = lax.dynamic_update_slice_in_dim(
+                w.values, tree.values.reshape(-1, PAGE + 1)[w.row][None], first, 0
+            )
+            v = values[0]
+            q = number(guide.q_weight) * q + number(guide.v_weight) * v
+        else:
+            values = ()
+        if problem.choice.urgent:  # thesis Algorithm 10
+            score = jnp.where(n > 0, q + w.bonus[:, None] / jnp.sqrt(jnp.maximum(n, 1)), jnp.inf)
+        else:
+            score = q + w.bonus[:, None] / jnp.sqrt(1 + n)  # eq. 3
+        there = slots < jnp.minimum(w.count - w.offset, PAGE)[:, None]
+        if valued and not eager:  # one that was not tried yet stands after those that were
+            there &= (slots == 0) | (n > 0) | (jnp.roll(n, 1, axis=1) > 0)
+        score = jnp.where(there, score, -jnp.inf)
+        scores = lax.dynamic_update_slice_in_dim(w.scores, score[None], first, 0)
+        score = scores[0]
+        j = jnp.argmax(score, axis=1).astype(jnp.int32)
+        top = pick(score, 0, j)
+        edge, link = w.row * ROW + j, row[:, LINK]
+        better = top > w.best.score  # the first maximum wins
+        edge = jnp.where(better, edge, w.best.edge)
+        below = lax.dynamic_update_slice_in_dim(
+            w.below, edges[edge[:, None] + columns][None], first, 0
+        )
+        child, reward = below[0, :, 0].astype(jnp.int32), below[0, :, 1]
+        visits = jnp.where(better, pick(row, VISITS, j).astype(jnp.int32), w.best.visits)
+        found = Best(
+            jnp.where(better, top, w.best.score),
+            edge,
+            jnp.where(better, w.offset + j, w.best.slot),
+            visits,
+            child,
+            reward,
+        )
+        # without a link there is an unvisited slot here, and later ones score the same; with values
+        # all pages are linked
+        more = ~w.done & (link > 0) & (w.offset + PAGE < w.count)
+        taken = ~w.done & ~more
+        descend = taken & (found.child > 0)
+        count, grows, bonus = of_node(found.visits)
+        level = jnp.where(taken, w.depth, w.path.shape[0])
+        return Walk(
+            node=jnp.where(descend, found.child, w.node),
+            row=jnp.where(
+                more,
+                link.astype(jnp.int32) * lanes + lane,
+                jnp.where(descend, found.child * lanes + lane, w.row),
+            ),
+            offset=jnp.where(more, w.offset + PAGE, 0),
+            count=jnp.where(descend, count, w.count),
+            grows=jnp.where(descend, grows, w.grows) if eager else (),
+            bonus=jnp.where(descend, bonus, w.bonus),
+            reward=jnp.where(descend, found.reward, w.reward),
+            depth=w.depth + descend.astype(jnp.int32),
+            best=jax.tree.map(
+                lambda a, b: jnp.where(w.done, b, a),
+                found._replace(score=jnp.where(descend, -jnp.inf, found.score)),
+                w.best,
+            ),
+            done=w.done | (taken & (found.child <= 0)),
+            path=w.path.at[level, lane].set(found.edge, mode="drop"),
+            desk=desk,
+            scores=scores,
+            below=below,
+            trail=w.trail.at[jnp.where(descend, w.depth + 1, w.trail.shape[0]), lane].set(
+                found.child, mode="drop"
+            ),
+            values=values,
+            last=w.last.at[level, lane].set(w.row, mode="drop") if eager else (),
+            new=(
+                w.new.at[level, lane].set(jnp.where(w.grows, w.count, 0), mode="drop")
+                if eager
+                else ()
+            ),
+        )
+
+    node, visits, reward, depth, path, trail = (
+        tree.root,
+        tree.root_visits,
+        tree.root_reward,
+        tree.depth,
+        tree.path,
+        tree.trail,
+    )
+    # straight to the last node of the best episode's path, which was visited once
+    if follows(tree):
+        lead = tree.lead
+        place = (lead.node, jnp.ones_like(visits), lead.reward, lead.depth, lead.path, lead.trail)
+        root = (node, visits, reward, depth, path, trail)
+        node, visits, reward, depth, path, trail = (
+            jnp.where(lead.on if a.ndim == 1 else lead.on[None], a, b)
+            for a, b in zip(place, root, strict=True)
+        )
+    row = node * lanes + lane
+    count, grows, bonus = of_node(visits)
+    nobody = Best(
+        jnp.full((lanes,), -jnp.inf, dtype), nil, nil, nil, nil, jnp.zeros((lanes,), dtype)
+    )
+    stay = ~tree.alive | tree.ended
+    start = Walk(
+        node,
+        row,
+        nil,
+        count,
+        grows,
+        bonus,
+        reward,
+        depth,
+        nobody,
+        stay,
+        path,
+        trail,
+        *(jnp.zeros((2, lanes, n), dtype) for n in (CHILD, PAGE + 1, 2)),
+        jnp.zeros((2, lanes, PAGE + 1), dtype) if valued else (),
+        *(jnp.zeros(tree.path.shape, jnp.int32) if eager else () for _ in range(2)),
+    )
+    return lax.while_loop(lambda w: jnp.any(~w.done), body, start)

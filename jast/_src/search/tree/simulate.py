@@ -1,0 +1,314 @@
+"""One simulation in every tree: select, expand, roll out, back up."""
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+
+from jast._src.core.transition import Progress, blank, conclude
+from jast._src.search.lanes import select_lanes
+from jast._src.search.tree.best_episode import (
+    Lead,
+    fed_of,
+    feed_level,
+    follows,
+    packed,
+    update_lead,
+)
+from jast._src.search.tree.child_values import evaluate_children
+from jast._src.search.tree.layout import (
+    CHILD,
+    FAILURE,
+    FRESH,
+    INVALID,
+    LINK,
+    PAGE,
+    RAN,
+    RETURNS,
+    REWARD,
+    ROW,
+    VISITS,
+    Node,
+    choose,
+    choose_rollout,
+    levels,
+    node_shapes,
+    of_lanes,
+    take,
+)
+from jast._src.search.tree.packing import pack, unpack
+from jast._src.search.tree.select import select
+
+__all__ = ["child_state", "grow", "replay_to"]
+
+
+def grow(problem, tree, begin_at, end_at, memoize="node", axes=None):
+    """Run simulations ``begin_at`` .. ``end_at - 1`` in every tree (traced: one program for any
+    number); none where all trees are at their end.
+    """
+    end_at = jnp.where(jnp.any(tree.alive), end_at, begin_at)
+    return lax.fori_loop(
+        begin_at, end_at, lambda i, tree: _simulation(problem, axes, tree, i, memoize), tree
+    )
+
+
+def _simulation(problem, axes, tree, i, memoize):
+    lanes = tree.key.shape[0]
+    lane = jnp.arange(lanes, dtype=jnp.int32)
+    walk = select(problem, tree)
+    fresh = tree.alive & ~tree.ended & (walk.best.child == 0)
+    nothing = jnp.zeros((lanes,), bool)
+    zero = jnp.zeros((lanes,), tree.edges.dtype)
+    recorded, episodic = not isinstance(tree.trials, tuple), problem.sim.episodic
+    source = jnp.where(tree.lead.on & fresh, tree.lead.source, 0) if follows(tree) else ()
+
+    def without_log_p(progress):
+        return progress if recorded else progress._replace(log_prob=zero)
+
+    def expand():
+        """The new child of each tree; and the node it is a child of, or the episode's end that
+        selection ran into.
+        """
+        at = jnp.where(fresh, walk.node, -walk.best.child)
+        desk = lax.dynamic_update_slice_in_dim(
+            tree.desk, tree.nodes[at, lane][None], jnp.minimum(i, 0), 0
+        )
+        like = node_shapes(tree, memoize)
+        node = jax.vmap(lambda w: unpack(w, like))(desk[0])
+        state, replayed = (
+            (node.state, jnp.zeros_like(at))
+            if memoize == "node"
+            else replay_to(problem, axes, tree, walk.trail, walk.depth, memoize)
+        )
+        so_far = node.log_prob if recorded else zero
+        before = Progress(
+            state,
+            so_far,
+            walk.reward,
+            node.distance,
+            nothing,
+            nothing,
+            nothing,
+            zero if episodic else (),
+        )
+        of = (source, fed_of(tree, jnp.maximum(source - 1, 0), lane)) if follows(tree) else ((), ())
+        child = jax.vmap(_child, in_axes=(axes, 0, 0, 0, 0, 0, 0, 0))(
+            problem, tree.key, walk.node, walk.best.slot, walk.depth, before, *of
+        )
+        known = node.reward, node.failure, node.invalid, (node.distance, so_far) if recorded else ()
+        return (
+            desk,
+            without_log_p(child),
+            replayed,
+            known,
+            fed_of(tree, jnp.zeros_like(lane) + i, lane),
+        )
+
+    # in a conditional, so that all reads of the tree are over before the first write: otherwise XLA
+    # copies the tree
+    def nobody():
+        blanks = jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), jax.eval_shape(expand)[1:])
+        return tree.desk, *blanks
+
+    desk, child, replayed, (known_reward, known_failure, known_invalid, known_trial), fed = (
+        lax.cond(jnp.any(tree.alive), expand, nobody)
+    )
+
+    # roll out; lanes that have ended step on, and only what is summed up is masked (and the state,
+    # where it is yet to be judged)
+    key = jax.vmap(jax.random.fold_in, in_axes=(0, None))(tree.key, i)
+    middle = feed_level(problem.sim)
+
+    def roll(carry):
+        level, steps, at, taken = carry
+        live = ~at.done
+        after, x = jax.vmap(_rolled, in_axes=(axes, 0, 0, 0, 0, 0))(
+            problem, key, tree.key, level, at, fed
+        )
+        kept = jax.tree.map(
+            lambda a, b: jnp.where(live, b, a), at._replace(state=()), after._replace(state=())
+        )
+        if problem.choice.feed:
+            here = live & (level == middle)
+            taken = jnp.where(here[:, None], jax.vmap(packed)(here, x), taken)
+        state = select_lanes(live, after.state, at.state) if episodic else after.state
+        return level + 1, steps + _one(live), without_log_p(kept._replace(state=state)), taken
+
+    # a random start is a level, but no step
+    steps = _one(fresh & (walk.depth >= levels(problem.sim) - problem.sim.horizon))
+    carry = (
+        walk.depth + 1,
+        steps,
+        child._replace(done=child.done | ~fresh),
+        jnp.zeros_like(fed) if problem.choice.feed else (),
+    )
+    _, steps, end, taken = lax.while_loop(lambda c: jnp.any(~c[2].done), roll, carry)
+    if episodic:
+        end = jax.vmap(lambda p, e, live: conclude(p.sim, p.reward, e, live), in_axes=(axes, 0, 0))(
+            problem, end, fresh
+        )
+        child = jax.tree.map(
+            lambda a, b: jnp.where(child.done, b, a),
+            child._replace(state=()),
+            end._replace(state=()),
+        )._replace(state=child.state)
+
+    value = jnp.where(fresh, end.reward, known_reward)
+    finite = jnp.isfinite(value)
+    worst = jnp.where(finite & tree.alive, jnp.minimum(tree.worst, value), tree.worst)
+    backed = jnp.where(finite, value, jnp.where(jnp.isfinite(worst), worst, 0))
+    first = tree.ended & tree.alive
+    failed, invalid = (
+        jnp.where(fresh, end.failure, known_failure),
+        jnp.where(fresh, end.invalid, known_invalid),
+    )
+    bits = (
+        _bit(fresh | first, FRESH) | _bit(failed, FAILURE) | _bit(invalid, INVALID) | jnp.uint8(RAN)
+    )
+    bits = jnp.where(tree.alive, bits, 0).astype(jnp.uint8)
+    state = child.state if memoize == "node" else ()
+    numbers = child.reward, child.distance, child.failure, child.invalid
+    kept = Node(
+        walk.node, walk.best.slot, *numbers, state, source, child.log_prob if recorded else ()
+    )
+    trial = (
+        tuple(
+            jnp.where(fresh, a, b)
+            for a, b in zip((end.distance, end.log_prob), known_trial, strict=True)
+        )
+        if recorded
+        else ()
+    )
+    tree = tree._replace(
+        edges=_back_up(tree, walk, fresh, child, backed, i + 1, link=not problem.values),
+        nodes=lax.dynamic_update_slice_in_dim(tree.nodes, jax.vmap(pack)(kept)[None], i + 1, 0),
+        desk=desk,
+        pages=tree.pages if problem.values else tree.pages + _one(fresh & _fills(walk)),
+        root_visits=tree.root_visits + _one(tree.alive),
+        turn=tree.turn + jnp.where(tree.alive, jnp.stack([jnp.ones_like(backed), backed]), 0),
+        worst=worst,
+        steps=tree.steps + steps + jnp.where(fresh, replayed, 0),
+        log=lax.dynamic_update_slice_in_dim(tree.log, value[None], i, 0),
+        outcome=lax.dynamic_update_slice_in_dim(tree.outcome, bits[None], i, 0),
+        alive=tree.alive & ~tree.ended,
+        lead=(
+            update_lead(tree, walk, fresh, child, value, failed, i, taken)
+            if isinstance(tree.lead, Lead)
+            else ()
+        ),
+        trials=(
+            lax.dynamic_update_slice_in_dim(tree.trials, jnp.stack(trial)[None], i, 0)
+            if recorded
+            else ()
+        ),
+    )
+    if not problem.values:
+        return tree
+    return evaluate_children(
+        problem,
+        axes,
+        tree,
+        walk,
+        fresh,
+        lambda lane, level, live: replay_to(
+            problem, axes, tree, walk.trail, level, memoize, lane, live
+        ),
+        memoize,
+    )
+
+
+def _back_up(tree, walk, fresh, child, value, new, link):
+    """The edges with one more visit and return along each path, and the new children in their
+    slots: one scatter, since what is new was 0.
+    """
+    nowhere = tree.edges.size
+    level = jnp.arange(tree.path.shape[0], dtype=jnp.int32)[:, None]
+    last = walk.depth + _one(tree.alive & ~tree.ended)
+    at = jnp.where((level >= tree.depth[None]) & (level < last[None]), walk.path, nowhere).reshape(
+        -1
+    )
+    ids = jnp.where(child.done, -new, new).astype(tree.edges.dtype)
+    slot = jnp.where(fresh, walk.best.edge, nowhere)
+    returns = jnp.broadcast_to(value[None], walk.path.shape).reshape(-1)
+    places, values = (
+        [at + VISITS, at + RETURNS, slot + CHILD, slot + REWARD],
+        [jnp.ones_like(returns), returns, ids, child.reward],
+    )
+    if link:  # where the page is full now, another goes on
+        places.append(jnp.where(fresh & _fills(walk), walk.best.edge // ROW * ROW + LINK, nowhere))
+        values.append(tree.pages.astype(tree.edges.dtype))
+    return tree.edges.at[jnp.concatenate(places)].add(jnp.concatenate(values), mode="drop")
+
+
+def _fills(walk):
+    """Whether the chosen slot is the last of its page."""
+    return walk.best.edge % ROW == PAGE - 1
+
+
+def replay_to(problem, axes, tree, trail, depth, memoize, lane=None, live=None):
+    """The simulator's state at the node ``trail[depth]`` of each tree, from the state that is kept,
+    and the simulator steps that it took to get there.
+
+    Or of the trees ``lane`` [m], ``depth`` [m], where ``live`` [m].
+    """
+    like = node_shapes(tree, memoize)
+    key, base, first = (
+        tree.key,
+        tree.base,
+        tree.depth if memoize == "root" else jnp.zeros_like(tree.depth),
+    )
+    running = tree.alive & ~tree.ended if live is None else live
+    if lane is None:
+        lane = jnp.arange(key.shape[0], dtype=jnp.int32)
+    else:
+        problem, key, base, first = (
+            of_lanes(problem, axes, lane),
+            key[lane],
+            jax.tree.map(lambda a: a[lane], base),
+            first[lane],
+        )
+    move = jax.vmap(child_state, in_axes=(axes, 0, 0, 0, 0, 0, 0, 0))
+
+    def body(carry):
+        level, state = carry
+        node = jax.vmap(lambda w: unpack(w, like))(tree.nodes[trail[level + 1, lane], lane])
+        live = running & (level < depth)
+        of = (
+            (node.source, fed_of(tree, jnp.maximum(node.source - 1, 0), lane))
+            if follows(tree)
+            else ((), ())
+        )
+        after = move(problem, key, node.parent, node.slot, level, state, *of)
+        return level + _one(live), select_lanes(live, after, state)
+
+    _, state = lax.while_loop(lambda c: jnp.any(running & (c[0] < depth)), body, (first, base))
+    chosen = levels(problem.sim) - problem.sim.horizon  # a random start is a level, but no step
+    return state, jnp.maximum(depth, chosen) - jnp.maximum(first, chosen)
+
+
+def _child(problem, tree_key, parent, slot, level, before, source, fed):
+    return take(
+        problem,
+        level,
+        before,
+        choose(problem, tree_key, parent, slot, level, before.state, source, fed),
+    )
+
+
+def _rolled(problem, key, tree_key, level, before, fed):
+    action = choose_rollout(problem, key, tree_key, level, before.state, fed)
+    return take(problem, level, before, action, rolling=True), action[1]
+
+
+def child_state(problem, tree_key, parent, slot, level, state, source=(), fed=()):
+    """One lane: the simulator's state at a node's child."""
+    return _child(
+        problem, tree_key, parent, slot, level, blank(problem.sim, state), source, fed
+    ).state
+
+
+def _one(pred):
+    return pred.astype(jnp.int32)
+
+
+def _bit(pred, bit):
+    return jnp.where(pred, bit, 0).astype(jnp.uint8)

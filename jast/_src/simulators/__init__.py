@@ -1,0 +1,1 @@
+"""Simulated systems with a source and a known truth."""

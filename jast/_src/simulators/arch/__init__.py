@@ -1,0 +1,1 @@
+"""The models and requirements of ARCH-COMP."""

@@ -1,0 +1,214 @@
+"""The explorers of `jast.stress`: ways to find failures, each a function ``(key, sim, budget) ->
+ExplorerResult``.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jast._src.core.actions import wide
+from jast._src.core.episode import Episode
+from jast._src.core.failures import empty
+from jast._src.core.rewards import likelihood
+from jast._src.core.signature import outline
+from jast._src.core.simulator import Simulator
+from jast._src.estimate.gaussians.design_points import design_points
+from jast._src.estimate.host_populations import cool, explore
+from jast._src.normal_space import transform as latent
+from jast._src.normal_space.mode_coordinates import centred
+from jast._src.runtime.host_errors import runs_on_host
+from jast._src.search.cem import cem
+from jast._src.search.forest import forest
+from jast._src.search.go_explore.go_explore import go_explore
+from jast._src.search.monte_carlo import monte_carlo
+
+__all__ = [
+    "EXPLORERS",
+    "Explorer",
+    "ExplorerResult",
+    "divide_budget",
+    "failures_at",
+    "has_quantiles",
+    "slow_cross_entropy",
+]
+
+MAX_FAILURES = 128
+"""Failures that an explorer hands over, the most."""
+PRUNES = 18
+"""Of a tree: 10 with more simulations each found failures of `jast.simulators.colav` in half as
+many trees.
+"""
+TREE_EVALUATIONS = 2500
+"""Evaluations for each tree of a forest, and at most as many trees as below."""
+MAX_TREES = 64
+"""Of a forest; a forest with more would prune too rarely."""
+COOLED_EVALUATIONS = 84
+"""Evaluations for each failure that is cooled: its wide draws, and a move at each width."""
+LEVEL_EVALUATIONS = 12
+"""Evaluations for each point that goes down the levels of the distance."""
+LEVEL_POINTS = 50, 1000
+"""Least and greatest number of them."""
+DESCENT_EVALUATIONS = 108
+"""Evaluations for each descent by gradients."""
+DESCENTS = 4, 48
+"""Least and greatest number of them."""
+ITERATIONS = 15
+"""Of the cross-entropy method."""
+SLOW_ITERATIONS = 30
+"""Iterations of `slow_cross_entropy`: half of them with twice the draws ends in worse basins."""
+SLOW_WIDTH = 0.5
+"""Width of its first draws around a failure."""
+ELITES = 10
+"""Share of the draws that the cross-entropy method fits, as its denominator. A convention."""
+
+
+class ExplorerResult(NamedTuple):
+    """What an explorer found."""
+
+    episodes: Episode
+    """Failing ones [m], on the host."""
+    evaluations: int
+    failing: int
+    """Failing episodes among those simulated, where they were counted; else m"""
+    invalid: int
+
+
+def plain_draws(key: jax.Array, sim: Simulator, budget: int) -> ExplorerResult:
+    """Draws of the model."""
+    reward = likelihood(sim)
+    return _from_search(monte_carlo(key, sim, episodes=budget, reward=reward, top=MAX_FAILURES))
+
+
+def cooled_noise(key: jax.Array, sim: Simulator, budget: int) -> ExplorerResult:
+    """Wider noise, cooled down: chains that start where failures are frequent."""
+    return _from_points(sim, cool(key, sim, _number(budget, COOLED_EVALUATIONS, 1, MAX_FAILURES)))
+
+
+def distance_levels(key: jax.Array, sim: Simulator, budget: int) -> ExplorerResult:
+    """Subset simulation: down the levels of the miss distance."""
+    size = _number(budget, LEVEL_EVALUATIONS, *LEVEL_POINTS)
+    return _from_points(sim, explore(key, sim, size, max_evaluations=budget))
+
+
+def gradients(key: jax.Array, sim: Simulator, budget: int) -> ExplorerResult:
+    """Gradients of the miss distance, from draws of the model."""
+    found = design_points(key, sim, _number(budget, DESCENT_EVALUATIONS, *DESCENTS))
+    return _from_points(sim, found)
+
+
+def cross_entropy(key: jax.Array, sim: Simulator, budget: int) -> ExplorerResult:
+    """The cross-entropy method."""
+    return _from_search(_cem(key, sim, budget, ITERATIONS))
+
+
+def slow_cross_entropy(
+    key: jax.Array, sim: Simulator, budget: int, failures: Any = None
+) -> ExplorerResult:
+    """The cross-entropy method in many small steps, which cross from one basin to another where
+    slopes lead nowhere; around the likeliest of ``failures``, if any are given.
+    """
+    actions = None if failures is None else wide(SLOW_WIDTH)
+    about = dict(failures=failures, actions=actions)
+    return _from_search(_cem(key, centred(sim), budget, SLOW_ITERATIONS, **about))
+
+
+def search_forest(key: jax.Array, sim: Simulator, budget: int) -> ExplorerResult:
+    """A forest of search trees."""
+    trees = _number(budget, TREE_EVALUATIONS, 1, MAX_TREES)
+    each = max(10, budget // (PRUNES * trees))
+    about = dict(trees=trees, prunes=PRUNES, simulations=each)
+    return _from_search(forest(key, sim, **about, refine=0, top=MAX_FAILURES))
+
+
+def kept_states(key: jax.Array, sim: Simulator, budget: int) -> ExplorerResult:
+    """Restarts from kept states, for failures that take many things one after another."""
+    return _from_search(go_explore(key, sim, episodes=budget, refine=0, top=MAX_FAILURES))
+
+
+class Explorer(NamedTuple):
+    """A way to find failures, and where it serves."""
+
+    run: Callable[[jax.Array, Simulator, int], ExplorerResult]
+    min_evaluations: int | None
+    """Below which it is not worth a call; None where it is called only if nothing else found a
+    failure"""
+    needs_quantiles: bool = False
+    """Whether the disturbances need quantile functions"""
+    needs_gradients: bool = False
+
+
+EXPLORERS = {
+    "widened noise, cooled": Explorer(cooled_noise, COOLED_EVALUATIONS, needs_quantiles=True),
+    "plain draws": Explorer(plain_draws, 30),
+    "gradients": Explorer(
+        gradients, DESCENT_EVALUATIONS * DESCENTS[0], needs_quantiles=True, needs_gradients=True
+    ),
+    "levels of distance": Explorer(
+        distance_levels, LEVEL_EVALUATIONS * LEVEL_POINTS[0], needs_quantiles=True
+    ),
+    "cross-entropy": Explorer(cross_entropy, 600),
+    "forest": Explorer(search_forest, 2000),
+    "kept states": Explorer(kept_states, None),
+}
+"""By name; where the budget is small, those that come first are called."""
+
+
+def has_quantiles(sim: Simulator) -> bool:
+    """Whether an episode of ``sim`` is a point of normal numbers."""
+    about = outline(sim)
+    return about.start.quantile and about.disturbance.quantile
+
+
+def divide_budget(sim: Simulator, budget: int) -> dict[str, int]:
+    """The names of the explorers that work on ``sim``, with what each has of ``budget``
+    evaluations.
+    """
+    floats = all(jnp.issubdtype(s.dtype, jnp.floating) for s in jax.tree.leaves(outline(sim).x))
+    quantiles, differentiable = has_quantiles(sim), floats and not runs_on_host(sim)
+    least, left = {}, budget
+    for name, explorer in EXPLORERS.items():
+        fits = explorer.min_evaluations is not None and explorer.min_evaluations <= left
+        fits = fits and (quantiles or not explorer.needs_quantiles)
+        if fits and (differentiable or not explorer.needs_gradients):
+            least[name] = explorer.min_evaluations
+            left -= least[name]
+    return {name: n + left // len(least) for name, n in least.items()}
+
+
+def failures_at(sim: Simulator, points: np.ndarray) -> ExplorerResult:
+    """Those of the first points [m, D] of normal numbers that fail."""
+    points = points[:MAX_FAILURES]
+    if not len(points):
+        return ExplorerResult(empty(sim).episodes, 0, 0, 0)
+    e = latent.played(sim, points)
+    e = jax.tree.map(lambda a: a[e.failure], e)
+    return ExplorerResult(e, len(points), len(e.length), 0)
+
+
+def _number(budget, each, least, most):
+    """How many the budget affords at so many evaluations ``each``."""
+    return int(np.clip(budget // each, least, most))
+
+
+def _cem(key, sim, budget, iterations, **about):
+    """The `jast.search.SearchResult` of the cross-entropy method."""
+    samples = max(10, budget // iterations)
+    elites = max(2, samples // ELITES)
+    numbers = dict(samples=samples, elites=elites, iterations=iterations)
+    return cem(key, sim, **numbers, **about, refine=0, top=MAX_FAILURES)
+
+
+def _from_search(result: Any) -> ExplorerResult:
+    """The failures of a `jast.search.SearchResult`."""
+    found = result.failures.episodes
+    return ExplorerResult(found, result.episodes, int(result.failing), int(result.invalid))
+
+
+def _from_points(sim: Simulator, found: Any) -> ExplorerResult:
+    """The failures of an explorer that ends with points."""
+    result = failures_at(sim, np.asarray(found.points))
+    invalid = int(getattr(found, "invalid", 0))
+    return result._replace(evaluations=found.evaluations, invalid=invalid)

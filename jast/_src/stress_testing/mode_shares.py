@@ -1,0 +1,157 @@
+"""Which part of the probability of failure is of which failure mode."""
+
+import math
+from typing import Any
+
+import jax
+import numpy as np
+
+from jast._src.core.counter_prng import numpy_generator
+from jast._src.core.simulator import Simulator
+from jast._src.estimate.population.failure_sample import Sample
+from jast._src.estimate.proposal_search.mixture_draws import resample
+from jast._src.estimate.redraw import redraw
+from jast._src.normal_space import transform as latent
+from jast._src.normal_space.mode_coordinates import centred
+from jast._src.search.refine.connectivity import Paths, assigned, nearest
+from jast._src.search.refine.modes import UNKNOWN, Modes
+from jast._src.util.intervals import effective_interval
+
+__all__ = ["corrected_shares", "mode_shares", "shares_cost"]
+
+MIN_BUDGET = 10_000
+"""Evaluations of the whole budget below which nothing is told: draws would be too great a part."""
+LARGE_BUDGET = 100_000
+"""Evaluations of the whole budget from which on there are more draws."""
+SMALL_DRAWS = 1024
+"""Draws of the proposal below a large budget: a tenth of it at most."""
+LARGE_DRAWS = 4096
+"""Draws of the proposal with a large budget: shares are then known to a few per cent."""
+DRAWS_PER_FAILURE = 4
+"""Of this many draws one failure is chosen, by weight."""
+MAX_PATH_FAILURES = 128
+"""Failures that are told apart by paths, too."""
+PATHS_SHARE = 0.05
+"""Share of the budget that these paths may cost."""
+
+
+def shares_cost(budget: int) -> int:
+    """Evaluations that `mode_shares` takes at most, nearly: the last paths may take more."""
+    n = _number_of_draws(budget)
+    return n + n // DRAWS_PER_FAILURE + int(PATHS_SHARE * budget) if n else 0
+
+
+def mode_shares(
+    key: jax.Array, sim: Simulator, q: Any, modes: Modes, budget: int
+) -> tuple[Modes, int, int]:
+    """``modes`` with the share of the probability that each has and its 95 % interval, told from
+    failures of ``q``: of a proposal, or of the `Sample` that populations leave.
+
+    Every failure is of the mode in whose direction it lies; a part of them are told apart by paths,
+    too, and say how many of those that lie towards one mode are of another. What a path says is
+    taken as the truth: of the failures of the README's lane, of which many are far out and near to
+    both sides, it names the side on which they left the lane for four of five, for either side.
+
+    Returns:
+        (`Modes`, whose shares are NaN where there was nothing to tell them from; draws that failed;
+        evaluations).
+    """
+    n, k = _number_of_draws(budget), len(modes)
+    if k == 1:
+        return _with_shares(modes, np.ones(1), [(1.0, 1.0)]), 0, 0
+    unknown = _with_shares(modes, np.full(k, np.nan), [UNKNOWN] * k)
+    if not n:
+        return unknown, 0, 0
+    z, unit, failing, spent = _draw_failures(key, sim, q, n)
+    if not failing:
+        return unknown, 0, spent
+    of_modes = centred(sim)
+
+    def place(e):
+        return latent.normal_of(of_modes, e).astype(np.float64), np.asarray(e.length)
+
+    bests = [m.failure._replace(states=None) for m in modes]
+    targets = place(jax.tree.map(lambda *a: np.stack([np.asarray(b) for b in a]), *bests))
+    points, ends = place(latent.played(sim, z))
+    step = len(z) // MAX_PATH_FAILURES
+    some = np.arange(step // 2, len(z), step)
+    paths = Paths(of_modes, int(PATHS_SHARE * budget))
+    exact = assigned(paths, (points[some], ends[some]), targets, np.arange(k))
+    found = corrected_shares(nearest(points, targets[0]), some, exact, unit, k)
+    return _with_shares(modes, *found), failing, spent + len(z) + paths.spent
+
+
+def corrected_shares(
+    near: np.ndarray, some: np.ndarray, exact: np.ndarray, unit: np.ndarray, k: int
+) -> tuple[np.ndarray, list[tuple[float, float]]]:
+    """The shares of ``k`` modes and their 95 % intervals.
+
+    The variance is that of what each independent unit adds to an error (of first order), by which
+    the choice of the failures, their weights and the correction all count. Where none or all
+    failures are of a mode, as many of ``some`` as are independent bound its share, as counts.
+
+    Args:
+        near: [m] the mode in whose direction each failure lies.
+        some: [f] those of them that were told apart by paths, and
+        exact: [f] their modes.
+        unit: [m] the draw, or the first point of a population, that each comes from; units are
+            independent.
+        k: modes.
+
+    Returns:
+        (shares [k], their (low, high)).
+    """
+    one_hot, m = np.eye(k), len(near)
+    seen = one_hot[near[some]].T @ one_hot[exact]
+    total = seen.sum(axis=1, keepdims=True)
+    # [near, exact]
+    truly = np.where(total > 0, seen / np.maximum(total, 1), one_hot)
+    lying = one_hot[near].mean(axis=0)
+    found = lying @ truly
+    error = (truly[near] - found) / m
+    weight = lying[:, None] / np.maximum(total, 1)
+    error[some] += weight[near[some]] * (one_hot[exact] - truly[near[some]])
+    _, unit = np.unique(unit, return_inverse=True)
+    added = np.stack([np.bincount(unit, e) for e in error.T], axis=1)
+    variance = (added**2).sum(axis=0) * len(added) / max(len(added) - 1, 1)
+    independent, among_some = _effective_number(unit), _effective_number(unit[some])
+
+    def interval(share, variance):
+        if not 0 < share < 1:
+            return effective_interval(share, among_some, math.inf if independent > 1 else 0.0)
+        number = min(share * (1 - share) / max(variance, 1e-300), m)
+        return effective_interval(share, number, independent - 1)
+
+    return found, [interval(*map(float, pair)) for pair in zip(found, variance, strict=True)]
+
+
+def _effective_number(unit):
+    """How many units of equal size would be as independent as these."""
+    return float(len(unit) ** 2 / (np.bincount(unit) ** 2.0).sum())
+
+
+def _draw_failures(key, sim, q, n):
+    """Failures chosen by weight (points [m, D], the independent unit of each [m]), how many there
+    were, and evaluations.
+    """
+    if isinstance(q, Sample):  # which have been run
+        rows = resample(q.log_weight, n // DRAWS_PER_FAILURE, numpy_generator(key).random())
+        return q.points[rows], q.group[rows], len(q.points), 0
+    z, o, log_w = redraw(key, sim, q, n)
+    if not (failing := int(o.failure.sum())):
+        return z[:0], np.zeros(0, int), 0, n
+    log_w = np.where(o.failure, log_w.astype(np.float64), -np.inf)
+    rows = resample(log_w, n // DRAWS_PER_FAILURE, 0.5)
+    return z[rows], rows, failing, n
+
+
+def _with_shares(modes, shares, intervals):
+    each = zip(modes, shares, intervals, strict=True)
+    shared = (m._replace(share=float(s), share_interval=tuple(i)) for m, s, i in each)
+    return Modes(shared, modes.evaluations)
+
+
+def _number_of_draws(budget):
+    if budget < MIN_BUDGET:
+        return 0
+    return LARGE_DRAWS if budget >= LARGE_BUDGET else SMALL_DRAWS

@@ -1,0 +1,477 @@
+"""jast.stress: check, nominal, explorers, refinement, modes, probability; one budget."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+import jax
+import numpy as np
+
+from jast._src.core.check import check
+from jast._src.core.episode import rollout
+from jast._src.core.failures import Failures, collect, empty, merge
+from jast._src.core.nominal import BRIEF, nominal
+from jast._src.core.rewards import likelihood
+from jast._src.core.simulator import Simulator, require_simulator
+from jast._src.estimate import budgets
+from jast._src.estimate.budgets import MIN_POPULATION_BUDGET
+from jast._src.estimate.failure_probability import MIN_BUDGET as MIN_ESTIMATE_BUDGET
+from jast._src.estimate.failure_probability import failure_probability
+from jast._src.estimate.few_calls import few_calls
+from jast._src.estimate.monte_carlo import monte_carlo
+from jast._src.estimate.population.descents import SETTINGS, cool_failures
+from jast._src.estimate.population.failure_sample import Sample
+from jast._src.estimate.population.population import by_populations
+from jast._src.estimate.proposal_search.mixture_draws import resample
+from jast._src.estimate.redraw import redraw
+from jast._src.normal_space import transform as latent
+from jast._src.runtime import work
+from jast._src.runtime._jax import briefly
+from jast._src.runtime.checkpoints import keep_answers, open_checkpoint
+from jast._src.runtime.progress_bar import Watch
+from jast._src.search.refine.modes import Mode, Modes, modes, spread
+from jast._src.search.refine.refine import refine
+from jast._src.stress_testing.explorers import (
+    EXPLORERS,
+    ExplorerResult,
+    divide_budget,
+    failures_at,
+    has_quantiles,
+    slow_cross_entropy,
+)
+from jast._src.stress_testing.mode_shares import mode_shares, shares_cost
+from jast._src.stress_testing.report import Report, Tried
+from jast._src.util import checks
+from jast._src.util.display import call_settings
+
+if TYPE_CHECKING:
+    import chex
+
+    from jast._src.core.typing import Callback, Executor, PathLike
+
+__all__ = ["DEFAULT_BUDGET", "stress"]
+
+MIN_BUDGET = 300
+"""Evaluations of a call, at least: with fewer no explorer is worth a call."""
+DEFAULT_BUDGET = 200_000
+"""Evaluations by default where populations are not the answer."""
+MAX_SURROGATE_NUMBERS = 20
+"""Numbers of an episode up to which a surrogate tells the probability."""
+REDRAWN_EPISODES = 400
+"""Draws of the estimate's proposal, where only it found failures."""
+MIN_COUNTED_EPISODES = 100
+"""Plain draws for the probability, at least, where nothing else tells it."""
+MODES_SHARE = 0.05
+"""Share of the budget that telling modes apart may cost at most."""
+EVEN_SHARE = 0.5
+"""Share of the search that all explorers divide evenly."""
+FURTHER_CALLS = 6
+"""Calls of explorers that divide the rest."""
+GAIN_DECAY = 0.1
+"""How much of its last gain is expected of an explorer that gained nothing since."""
+MIN_DIVIDED_BUDGET = 2000
+"""Evaluations below which each explorer is called once, and failures are refined once."""
+OPTIMAL_RESIDUAL = 1e-2
+"""A residual at which a failure is locally likeliest."""
+FEW_MODES = 4
+"""With so few modes, and a likeliest failure that is locally so, `slow_cross_entropy` would find
+nothing else: its evaluations are the estimate's."""
+COOLING_SHARE = 0.2
+"""Share of the evaluations by which failures of the populations are cooled to the likeliest."""
+INDEPENDENT_SHARE = 0.25
+"""Share of these by which no point replaces another, so that no mode is lost. With all of them the
+likeliest failure of the crossing is .35 nats less likely, of the cart-pole 6, of the ship 4; with
+none they are as likely as with a quarter, or up to 2 nats likelier."""
+REFINE_EVALUATIONS = 50_000
+"""Evaluations for pulling what was cooled to where log p is greatest, at most an eighth of all: on
+the crossing, the cart-pole and the ship failures are as likely with half as many and twice as many
+coolings, which cost a tenth of the CPU time."""
+POOL_FACTOR = 32
+"""Failures in the pool for each that is returned: modes are told apart among these."""
+REFINED_FACTOR = 8
+"""Failures that refinement starts from for each that is returned."""
+FOUND_FACTOR = 4
+"""Failures of one explorer for each that is returned."""
+
+
+class BudgetShares(NamedTuple):
+    """Of the budget; what is left is for the probability."""
+
+    nominal: float
+    search: float
+    slow_search: float
+    refine: float
+
+
+LARGE_SHARES = BudgetShares(nominal=0.05, search=0.15, slow_search=0.14, refine=0.18)
+"""Where the estimate finds its own proposal."""
+SURROGATE_SHARES = BudgetShares(nominal=0.05, search=0.3, slow_search=0, refine=0.35)
+"""Where a surrogate tells the probability with few evaluations."""
+COUNTING_SHARES = BudgetShares(nominal=0.125, search=0.35, slow_search=0.2, refine=0.325)
+"""Where only plain draws tell it."""
+
+
+def stress(
+    key: chex.PRNGKey,
+    sim: Simulator,
+    budget: int | None = None,
+    *,
+    seconds: float | None = None,
+    top: int = 64,
+    progress: bool = False,
+    callback: Callback | None = None,
+    checkpoint: PathLike | None = None,
+    executor: Executor | None = None,
+    devices: Sequence[jax.Device] | None = None,
+) -> Report:
+    """How does the system fail, how likely, and what is its likeliest failure?
+
+    It checks the simulator, and runs it undisturbed and under plain draws. By default its rate is
+    then measured. A system that simulates 300,000 episodes in some eight CPU seconds is answered by
+    populations that stay on the device (`jast.estimate.population`): they tell the probability,
+    their failures are cooled to the likeliest near to each, pulled to where log p is greatest
+    (`jast.search.refine`), and sorted into failure modes, each with its share of the probability.
+    The same holds of every system in JAX with a budget from 300,000 on.
+
+    For the others a portfolio of explorers looks for failures (those whose failures get likelier
+    are given more of the budget), and the probability is that of
+    `jast.estimate.failure_probability`, for which the modes found are where to look; they never
+    enter the estimate itself.
+
+    Args:
+        key: consumed.
+        sim: the simulator.
+        budget: evaluations (episodes; one with its gradient counts as 3 or 4) in all, nearly; at
+            least 300. Default: what a cheap system simulates in some eight CPU seconds, at most
+            33,554,432; 200,000 of others. The report's ``settings`` name the one that was used.
+            Below 10,417 the probability is a surrogate's (`failure_probability` with few calls),
+            and with more than 20 numbers an episode that of the plain draws alone.
+        seconds: in place of ``budget``: as many evaluations as the system simulates in so many CPU
+            seconds (a black box: seconds), rounded down to 2^k or 3 2^k.
+        top: failures kept, at least one for each mode.
+        progress: whether there is a bar.
+        callback: called as ``callback(done, total, None)`` after every piece of the work.
+        checkpoint: a folder that keeps finished populations and what the system answered to
+            searches, refinement and draws. The same call, with its ``budget``, then goes on where
+            it was stopped, to the same result; first looks run again.
+        executor: runs the parts of the probability: anything with ``submit(function, *args)``, such
+            as the executors of `concurrent.futures` and Dask's client. It changes no result.
+        devices: some of `jax.devices()`, one thread each, likewise (docs/scale.md).
+
+    Returns:
+        `Report`: print it. A KeyboardInterrupt ends the work with what was found by then, and is
+        raised before there is anything.
+
+    Raises:
+        ValueError: for a budget below 300, a budget together with ``seconds``, and where the
+            simulator's functions do not fit together.
+
+    Example:
+        >>> import jax, jast
+        >>> report = jast.stress(jax.random.key(0), jast.simulators.walk1d(), 2000)
+        >>> bool(report.failures.best.failure), report.probability.mean > 0
+        (True, True)
+    """
+    name = "stress"
+    checks.check_random_key(name, key)
+    budgets.check_budget_or_seconds(name, budget, seconds)
+    if budget is not None:
+        budget = checks.whole_number(name, "budget", budget, MIN_BUDGET)
+    top = checks.whole_number(name, "top", top, 1)
+    require_simulator(name, sim)
+    check(sim)
+    if budget is None and seconds is None and not has_quantiles(sim):
+        budget = DEFAULT_BUDGET
+    if budget is None:
+        budget = budgets.measure_budget(name, key, sim, seconds, MIN_BUDGET, DEFAULT_BUDGET)
+    settings = call_settings(name, key, budget=budget, top=top)
+    ways = work.placement(name, executor, devices)
+    with (
+        open_checkpoint(name, checkpoint, key, sim=sim, budget=budget, top=top) as store,
+        keep_answers(store),
+        briefly(not budgets.uses_populations(sim, budget)),
+        Watch(name, budget, "sim", progress, callback) as watch,
+    ):
+        ways = ways._replace(store=store)
+        test = _StressTest(key, sim, budget, top=top, watch=watch, ways=ways, checkpoint=checkpoint)
+        try:
+            test.run_nominal()
+            if test.cheap:
+                test.run_populations()
+            else:
+                test.search()
+                test.refine()
+                test.estimate()
+        except KeyboardInterrupt:
+            if test.nominal is None:
+                raise
+            settings["interrupted"] = f"after {test.spent} of {budget} evaluations"
+    return test.report(settings)
+
+
+class _StressTest:
+    """What is known so far, and what it cost.
+
+    ``pool`` has the failures of explorers, ``refined`` those that refinement came to, and
+    ``failures`` what the report shows.
+    """
+
+    def __init__(self, key, sim, budget, top, watch, ways, checkpoint):
+        self.key, self.sim = key, sim
+        self.budget, self.top = budget, top
+        self.watch, self.ways = watch, ways
+        self.checkpoint, self.reward = checkpoint, likelihood(sim)
+        self.nominal = self.probability = None
+        self.pool = self.failures = self.refined = empty(sim)
+        self.modes, self.tried = Modes(), []
+        self.spent = self.invalid = 0
+        self.residual = self.late = np.nan
+        self.has_points = has_quantiles(sim)
+        large = (1 - sum(LARGE_SHARES)) * budget >= MIN_ESTIMATE_BUDGET
+        few_numbers = self.has_points and latent.dimension(sim) <= MAX_SURROGATE_NUMBERS
+        self.estimable = self.has_points and (large or few_numbers)
+        self.cheap = self.has_points and budgets.uses_populations(sim, budget)
+        shares = COUNTING_SHARES
+        if self.estimable:
+            shares = LARGE_SHARES if large else SURROGATE_SHARES
+        # what populations do not answer gains little from more
+        self.parts = BudgetShares(*(int(share * min(budget, DEFAULT_BUDGET)) for share in shares))
+        self.modes_budget = int(MODES_SHARE * budget)
+
+    def next_key(self):
+        self.key, key = jax.random.split(self.key)
+        return key
+
+    def note(self, name, evaluations, failing=0, best=-np.inf, invalid=0):
+        """Count a piece of the work."""
+        self.tried.append(Tried(name, int(evaluations), int(failing), float(best)))
+        self.spent += int(evaluations)
+        self.invalid += int(invalid)
+        self.watch.reach(min(self.spent, self.budget))
+        self.watch.tell()
+
+    def run_nominal(self):
+        """The system as it is."""
+        # populations draw plainly, too, and so few are compiled quickly
+        key, episodes = self.next_key(), BRIEF if self.cheap else self.parts.nominal
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)  # the report says it
+            self.nominal = n = nominal(key, self.sim, episodes)
+        found = [] if n.undisturbed is None or not bool(n.undisturbed.failure) else [n.undisturbed]
+        if n.first is not None:
+            found.append(rollout(jax.random.fold_in(key, n.first), self.sim))
+        for e in found:
+            self.pool = merge(self.pool, self.collect([e]), top=2)
+        self.note("nominal", n.episodes, n.failing, _best_log_density(self.pool), n.invalid)
+
+    def collect(self, episodes):
+        """The `Failures` of single episodes."""
+        each = [e._replace(states=None) for e in episodes]
+        stacked = jax.tree.map(lambda *a: np.stack([np.asarray(b) for b in a]), *each)
+        return collect(self.sim, self.reward, stacked)
+
+    def run_populations(self):
+        """The probability by populations, and the likeliest failures from theirs."""
+        cooling = int(COOLING_SHARE * self.budget)
+        refining = min(REFINE_EVALUATIONS, self.budget // 8)
+        rest = self.budget - self.spent - cooling - 2 * refining
+        rest = max(rest, MIN_POPULATION_BUDGET // 2)
+        self.watch.doing("estimating")
+        p = by_populations("stress", self.next_key(), self.sim, rest, ways=self.ways)
+        self.keep_probability(p, "populations")
+        sample = p.proposal
+        if not isinstance(sample, Sample):
+            # nothing leads to failures, or all does
+            self.parts = BudgetShares(nominal=0, search=refining, slow_search=0, refine=refining)
+            if not len(self.pool):
+                self.search()
+            return self.refine()
+        rows = resample(sample.log_weight, SETTINGS.cooled_failures, 0.5)
+        for name, replace, share in (
+            ("cooled", False, INDEPENDENT_SHARE),
+            ("cooled together", True, 1 - INDEPENDENT_SHARE),
+        ):
+            self.watch.doing("cooling failures")
+            points, spent = cool_failures(
+                self.next_key(), self.sim, sample.points[rows], int(share * cooling), replace
+            )
+            self.add_failures(name, failures_at(self.sim, points)._replace(evaluations=spent))
+        self.parts = BudgetShares(nominal=0, search=0, slow_search=0, refine=refining)
+        self.modes_budget = refining // 4
+        self.refine()
+        self.tell_shares(sample)
+
+    def search(self):
+        """Every explorer once; then those again whose failures get likelier for what they cost."""
+        total = self.parts.search
+        end, once = self.spent + total, total < MIN_DIVIDED_BUDGET
+        first = divide_budget(self.sim, total if once else int(EVEN_SHARE * total))
+        gains = {name: self.explore(name, each) for name, each in first.items()}
+        if once:
+            return
+        if not len(self.pool):  # nothing points to failures, or they are far away
+            self.explore("kept states", end - self.spent + self.parts.slow_search)
+        calls = dict.fromkeys(first, 1)
+        again = int((1 - EVEN_SHARE) * total / FURTHER_CALLS)
+        while self.spent + again <= end:
+            # of those that expect as much, the one that was called least
+            name = max(first, key=lambda n: (gains[n], -calls[n]))
+            # what paid once may pay again, but less is expected of it
+            gains[name] = max(self.explore(name, again), GAIN_DECAY * gains[name])
+            calls[name] += 1
+
+    def explore(self, name, budget):
+        """Call one explorer; returns by how much the likeliest failure got likelier per
+        evaluation.
+        """
+        before = _best_log_density(self.pool)
+        self.watch.doing(f"searching by {name}")
+        result = EXPLORERS[name].run(self.next_key(), self.sim, budget)
+        best = _best_log_density(self.add_failures(name, result))
+        if best <= before:
+            return 0.0
+        gain = 1.0 if before == -np.inf else best - before
+        return gain / max(result.evaluations, 1)
+
+    def add_failures(self, name: str, result: ExplorerResult) -> Failures:
+        """The failures that an explorer found, which join the pool."""
+        found = collect(self.sim, self.reward, result.episodes, top=FOUND_FACTOR * self.top)
+        self.pool = merge(self.pool, found, top=POOL_FACTOR * self.top)
+        best = _best_log_density(found)
+        self.note(name, result.evaluations, result.failing, best, result.invalid)
+        return found
+
+    def refine(self):
+        """The pool to where log p is greatest: many failures a little, then each mode's best."""
+        if not len(self.pool):
+            return
+        if not self.has_points:
+            self.failures, best = self.pool, self.pool[0]
+            self.modes = Modes([Mode(best, int(self.pool.counts.sum()), 1.0)])
+            return
+        self.pool = self.failures = spread(self.sim, self.pool, REFINED_FACTOR * self.top)
+        budget, start = self.parts.refine, self.pool
+        if budget < MIN_DIVIDED_BUDGET:
+            self.refine_from(start, budget)
+        else:
+            start = self.refine_from(start, int(0.5 * budget))
+            if not self.is_locally_likeliest():
+                start = self.search_slowly(start)
+            self.refine_from(start, int(0.5 * budget))
+        self.failures = merge(self.best_of_modes(), self.failures, top=self.top)
+
+    def refine_from(self, start: Failures, budget: int) -> Failures:
+        """Refine the failures ``start`` and tell modes apart; returns the best of each mode."""
+        self.watch.doing("refining failures")
+        result = refine(self.next_key(), self.sim, start, budget=max(100, budget))
+        found = result.failures
+        if len(found):
+            self.residual, self.late = float(result.residual[0]), float(result.late[0])
+            self.failures = merge(self.failures, found, top=REFINED_FACTOR * self.top)
+            self.refined = merge(self.refined, found, top=self.top)
+        best = _best_log_density(found)
+        self.note("refine", result.episodes, len(found), best, result.invalid)
+        self.watch.doing("telling modes apart")
+        candidates = found if len(found) else self.pool[:1]
+        if self.modes:  # none is lost to a second refinement that had no time for it
+            candidates = merge(candidates, self.best_of_modes(), top=REFINED_FACTOR * self.top)
+        self.modes = modes(self.sim, candidates, self.pool, budget=self.modes_budget)
+        self.note("telling modes apart", self.modes.evaluations)
+        return self.best_of_modes()
+
+    def is_locally_likeliest(self) -> bool:
+        """Whether slopes have led to the likeliest failure, and there are few basins."""
+        return self.residual < OPTIMAL_RESIDUAL and len(self.modes) <= FEW_MODES
+
+    def search_slowly(self, start: Failures) -> Failures:
+        """Likelier failures by many small steps, one half of them from the likeliest known."""
+        budget = self.parts.slow_search // 2
+        if budget < MIN_DIVIDED_BUDGET:
+            return start
+        self.watch.doing("searching by slow cross-entropy")
+        for name, around in (("slow cross-entropy", None), ("the same, from the best", start)):
+            result = slow_cross_entropy(self.next_key(), self.sim, budget, around)
+            start = merge(start, self.add_failures(name, result), top=REFINED_FACTOR * self.top)
+        return start
+
+    def best_of_modes(self) -> Failures:
+        """The likeliest failure of each mode."""
+        return self.collect([m.failure for m in self.modes])
+
+    def estimate(self):
+        """The probability, with what is left."""
+        self.watch.doing("estimating")
+        rest = max(self.budget - self.spent, 1)
+        folder = None if self.checkpoint is None else Path(self.checkpoint) / "probability"
+        places = dict(executor=self.ways.executor, devices=self.ways.devices, checkpoint=folder)
+        if not self.estimable:
+            n = max(rest, MIN_COUNTED_EPISODES)
+            p = monte_carlo(self.next_key(), self.sim, n, **places)
+            return self.keep_probability(p, "plain draws")
+        if not len(self.pool):  # the estimate may find what the search did not
+            rest -= self.parts.refine + self.parts.slow_search
+        if len(self.modes) > 1:
+            rest -= shares_cost(self.budget)
+        failures = self.refined if len(self.refined) else None
+        rest = max(rest, few_calls.LEAST)
+        p = failure_probability(self.next_key(), self.sim, rest, failures=failures, **places)
+        self.keep_probability(p, "probability")
+        if p.proposal is None:
+            return
+        if not len(self.pool):
+            self.redraw_failures(p.proposal)
+        self.tell_shares(p.proposal)
+
+    def keep_probability(self, p, name):
+        """Keep the `Estimate` ``p``, with the nominal draws among its plain ones, which they are
+        too.
+        """
+        drawn, own = p.plain or (0, 0, 0), self.nominal
+        own = own.failing, own.invalid, own.episodes
+        plain = tuple(a + b for a, b in zip(drawn, own, strict=True))
+        self.probability = p._replace(plain=plain)
+        self.note(name, p.episodes, p.failing, invalid=p.invalid)
+
+    def redraw_failures(self, q):
+        """Failures that the estimate's proposal draws, where the search found none."""
+        points, drawn, _ = redraw(self.next_key(), self.sim, q, REDRAWN_EPISODES)
+        result = failures_at(self.sim, np.asarray(points)[np.asarray(drawn.failure)])
+        evaluations = REDRAWN_EPISODES + result.evaluations
+        self.add_failures("the estimate's failures", result._replace(evaluations=evaluations))
+        self.refine()
+
+    def tell_shares(self, q):
+        """The share of the probability that each mode has, of failures drawn from the proposal."""
+        p = self.probability
+        if not (self.modes and p.reliable):
+            return
+        if p.draws is not None and isinstance(p.draws.source, latent.Latent):
+            q = p.draws.source  # independent draws tell more than few populations
+        self.watch.doing("shares of modes")
+        budget = min(self.budget, DEFAULT_BUDGET)
+        self.modes, failing, cost = mode_shares(self.next_key(), self.sim, q, self.modes, budget)
+        if cost:
+            self.note("shares of modes", cost, failing)
+
+    def report(self, settings):
+        return Report(
+            nominal=self.nominal,
+            failures=self.failures[: self.top],
+            modes=self.modes,
+            probability=self.probability,
+            residual=self.residual,
+            late=self.late,
+            tried=tuple(self.tried),
+            episodes=self.spent,
+            invalid=self.invalid,
+            settings=settings,
+            sim=self.sim,
+        )
+
+
+def _best_log_density(failures: Failures) -> float:
+    """log p relative to the mode of the likeliest; -inf where there is none."""
+    return float(failures.best.reward) if len(failures) else -np.inf

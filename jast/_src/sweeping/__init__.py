@@ -1,0 +1,1 @@
+"""`jast.sweep`: one function on many systems that differ in a setting."""

@@ -1,0 +1,1 @@
+"""Checks of arguments, public doors, pytrees, how results print, intervals."""

@@ -1,0 +1,77 @@
+"""Checks of settings, each with a ValueError that names the function and the setting, what was
+expected and what came.
+"""
+
+import importlib
+import operator
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jast._src.runtime._jax import is_traced
+
+__all__ = ["import_library", "number", "check_random_key", "real_number", "whole_number"]
+
+
+def import_library(function: str, module: str, extra: str) -> Any:
+    """The ``module`` of an ``extra`` of pyproject.toml; ImportError where that is not installed."""
+    try:
+        return importlib.import_module(module)
+    except ImportError as error:
+        name = module.partition(".")[0]
+        raise ImportError(f"{function} needs {name}: pip install 'jast[{extra}]'") from error
+
+
+def check_random_key(function: str, key: Any) -> None:
+    """ValueError unless ``key`` is one key of `jax.random`."""
+    dtype, shape = getattr(key, "dtype", None), getattr(key, "shape", None)
+    typed = dtype is not None and jnp.issubdtype(dtype, jax.dtypes.prng_key) and shape == ()
+    raw = dtype == np.uint32 and len(shape) == 1  # of jax.random.PRNGKey
+    if not (typed or raw):
+        received = f"{type(key).__name__} {key!r}" if dtype is None else f"{dtype}{list(shape)}"
+        hint = f": jax.random.key({key})" if type(key) is int else ""
+        raise ValueError(
+            f"{function}: key must be a jax.random.key{hint}, received {received[:80]}"
+        )
+
+
+def whole_number(function, name, value, least=1):
+    """``value`` as an int of at least ``least``."""
+    try:
+        number = least - 1 if isinstance(value, bool) else operator.index(value)
+    except (TypeError, jax.errors.JAXTypeError):
+        number = least - 1
+    if number < least:
+        raise ValueError(
+            f"{function}: {name} must be a whole number of at least {least}, received {value!r}"
+        )
+    return number
+
+
+def number(function, name, value, holds, expected):
+    """``value`` as a Python float, the same whatever the precision that JAX is set to, of a number
+    for which ``holds``.
+    """
+    real_number(function, name, value, holds, expected)
+    return float(value)
+
+
+def real_number(function, name, value, holds, expected):
+    """``value`` as a float array []; one that is not traced must be a number for which
+    ``holds``.
+    """
+    if not is_traced(value):
+        try:
+            good = (
+                not isinstance(value, str | bool)
+                and np.shape(value) == ()
+                and bool(holds(float(value)))
+            )
+        except (TypeError, ValueError):
+            good = False
+        if not good:
+            raise ValueError(f"{function}: {name} must be a number {expected}, received {value!r}")
+    value = jnp.asarray(value)
+    return value if jnp.issubdtype(value.dtype, jnp.floating) else value.astype(jnp.zeros(()).dtype)
