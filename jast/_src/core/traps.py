@@ -8,7 +8,6 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 from jax.custom_derivatives import SymbolicZero
-from jax.extend.core import Var
 
 from jast import distributions as D
 from jast._src.core.float_resolution import Probe, describe, probe
@@ -108,8 +107,7 @@ def _makes_keys(program: Any, given: list[bool]) -> tuple[bool, list[bool]]:
     known = {variable for variable, it in zip(program.invars, given, strict=True) if it}
     found = False
     for equation in program.eqns:
-        # numbers that are written in the program have no hash
-        inputs = [isinstance(v, Var) and v in known for v in equation.invars]
+        inputs = [_among(v, known) for v in equation.invars]
         if not any(inputs):
             continue
         found |= equation.primitive.name == "random_wrap"
@@ -122,7 +120,12 @@ def _makes_keys(program: Any, given: list[bool]) -> tuple[bool, list[bool]]:
             # what a loop carries may reach any of its outputs
             outputs = after if equation.primitive.name in CALLS else outputs
         known |= {v for v, it in zip(equation.outvars, outputs, strict=True) if it}
-    return found, [isinstance(v, Var) and v in known for v in program.outvars]
+    return found, [_among(v, known) for v in program.outvars]
+
+
+def _among(variable: Any, known: set[Any]) -> bool:
+    """Whether a variable of a jaxpr is ``known``; a number written there is none."""
+    return not hasattr(variable, "val") and variable in known
 
 
 def _equations(program: Any) -> Iterator[Any]:
