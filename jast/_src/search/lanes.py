@@ -32,7 +32,7 @@ __all__ = [
 ]
 
 
-NEVER = np.int32(2**31 - 1)
+NEVER = np.int32(2**31 - 1)  # the greatest int32: no simulation has this number
 EMPTY_HASH = np.uint32(0x9E3779B9)
 """The hash of no disturbance."""
 

@@ -22,8 +22,8 @@ from jast.distributions import Uniform, tent, where
 
 __all__ = ["COLLISION", "FerryState", "ferry"]
 
-SPEED = 5.0
-COLLISION = 5.0
+SPEED = 5.0  # m a step, of both vessels
+COLLISION = 5.0  # m between them
 
 
 class FerryState(NamedTuple):

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 __all__ = ["LandingState", "landing", "landing_probability"]
 
-STEPS = 10
+STEPS = 10  # of an approach
 
 
 class LandingState(NamedTuple):

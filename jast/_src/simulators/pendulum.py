@@ -25,10 +25,10 @@ if TYPE_CHECKING:
 
 __all__ = ["PendulumState", "pendulum"]
 
-STEPS = 40
-DT = 0.05
-TORQUE = 2.0
-SPEED = 8.0
+STEPS = 40  # of an episode
+DT = 0.05  # s
+TORQUE = 2.0  # N m, at most
+SPEED = 8.0  # rad/s, at most
 
 
 class PendulumState(NamedTuple):

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 __all__ = ["walk1d"]
 
-HORIZON = {"two-sided": 30, "one-sided": 10}
+HORIZON = {"two-sided": 30, "one-sided": 10}  # steps of an episode, as published
 
 
 def walk1d(

@@ -43,7 +43,7 @@ RANK = 1e-6  # part of the greatest singular value, below which one is rounding
 NOTHING = 1e-6  # a variance of rounding alone
 LEAST_VALUE = 1e-4  # eigenvalue of a covariance
 BAND = 0.9, 1.1  # factors on the edges of the band of noise, for its spread in small samples
-BAND_ITERATIONS = 20
+BAND_ITERATIONS = 20  # at most; a convention
 COMPONENTS_HELD = (40, 256)  # the range of the greatest number of components of a `Latent`
 MEMORY = 2**24  # numbers in all covariances of a `Latent` between these
 

@@ -64,12 +64,12 @@ __all__ = [
     "widths",
 ]
 
-PAGE = 15
+PAGE = 15  # children on a page: with the link a row of 16, a cache line of 64 bytes
 # columns of a page's row in Tree.edges
 VISITS, RETURNS, CHILD, REWARD = (column * (PAGE + 1) for column in range(4))
 # a page's last entry is no child: there stands the page that continues this one, or 0
 LINK = VISITS + PAGE
-ROW = 4 * (PAGE + 1)
+ROW = 4 * (PAGE + 1)  # numbers of a row: four columns
 
 FAILURE, FRESH, INVALID, RAN = 1, 2, 4, 8  # bits of Tree.outcome
 _NODE = jnp.uint32(1 << 31)  # addresses of children, apart from those of simulations

@@ -16,7 +16,7 @@ from jast._src.simulators.arch.f16_tables import DAMPING, LIFT, PITCHING, SLIPPI
 
 __all__ = ["F16", "Controls", "Loads", "motion"]
 
-GRAVITY = 32.17
+GRAVITY = 32.17  # ft/s2
 MASS = 1 / 1.57e-3
 """slug; rounded as in the book, whose check values need it so"""
 AREA = 300.0  # ft2

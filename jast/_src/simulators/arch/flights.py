@@ -29,7 +29,7 @@ BOX = (
     (math.pi / 4 + math.pi / 30, -0.35 * math.pi, -math.pi / 4 + math.pi / 8),
 )
 """The least and the greatest roll, pitch and yaw at the start, rad."""
-STEPS = 15
+STEPS = 15  # disturbances of an episode, each held for a second
 EACH = round(gcas.DURATION / gcas.DT) // STEPS
 """Samples of a step."""
 

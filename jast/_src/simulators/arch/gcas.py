@@ -50,8 +50,8 @@ LOAD = 5.0  # g
 DECK = 1000.0  # ft
 PULLS = 2.0  # seconds, at least
 SPEED = 540.0  # ft/s
-ALPHA = np.deg2rad(2.1215)
-POWER = 9.0
+ALPHA = np.deg2rad(2.1215)  # rad, at the start
+POWER = 9.0  # percent, at the start
 LIMITS = 25.0, 21.5, 30.0  # degrees
 STAGES = np.array([[0, 1 / 6], [0.5, 1 / 3], [0.5, 1 / 3], [1, 1 / 6]])
 """Of Runge-Kutta's method: how far along the last slope each is, and its weight."""

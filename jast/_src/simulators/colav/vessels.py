@@ -34,9 +34,9 @@ LINEAR, QUADRATIC, CUBIC = (
     (110.064, 116.487, 874.428),
     (13.965, 24.313, 0.0),
 )  # damping X, Y, N
-KP = (200.0, 200.0, 800.0)
-KI = (10.0, 10.0, 15.0)
-KD = (700.0, 700.0, 1600.0)
+KP = (200.0, 200.0, 800.0)  # proportional gains of surge, sway and yaw
+KI = (10.0, 10.0, 15.0)  # integral gains
+KD = (700.0, 700.0, 1600.0)  # derivative gains
 THRUST = (1000.0, 1000.0, 2000.0)  # greatest force (N) and moment (N m), each way: ours
 # greatest position error that the controller sees, m: ours (the published planner allows 5 along
 # the path, 3 across)
