@@ -84,8 +84,8 @@ def failure_probability(
     explorer was led to; ``unseen`` bounds what they did not meet. All are drawn from the model
     where plain Monte Carlo would be more exact, and where the proposal is given up but the model
     fails often enough. Where it does not, the answer is subset simulation's, and UNRELIABLE. So is
-    that of a system whose floats are too coarse (`core.float_resolution`), and an estimate with a
-    relative standard error above 5 %.
+    that of a system whose floats are too coarse, and an estimate with a relative standard error
+    above 5 %.
 
     Fewer than 5000 episodes are for systems that cost a second each. A Gaussian process learns the
     limit state from two thirds of them, 240 at most: the miss distance of the safe ones, and where

@@ -59,8 +59,8 @@ def monte_carlo(
     an exact interval, and Chernoff's and Jeffreys' upper bounds also where no failure was seen.
 
     `jast.nominal` is for a first look at a system, and `jast.search.monte_carlo` keeps the
-    failures. Where disturbances are cheap functions of normal numbers, these come from a counter
-    (`core.counter_prng`): Threefry would take most of the time of a cheap system. In float32 the
+    failures. Where disturbances are cheap functions of normal numbers, these come from a counter:
+    Threefry would take most of the time of a cheap system. In float32 the
     normal numbers of a step end at 5.42 standard deviations. A KeyboardInterrupt is treated as in
     `importance`.
 

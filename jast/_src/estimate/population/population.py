@@ -79,7 +79,7 @@ def population(
     of them reaches failures, its moves are doubled until its answer stays. The model's own draws,
     with which each population begins, are a third witness. Otherwise the estimate is UNRELIABLE and
     says which way saw what; so it is with a relative standard error above 5 %, and with coarse
-    floats (`core.float_resolution`). Where plain draws tell the probability soonest, it draws
+    floats. Where plain draws tell the probability soonest, it draws
     plainly.
 
     A failure mode that no way meets is missing without a sign. A KeyboardInterrupt ends it with the
