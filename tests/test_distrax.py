@@ -131,7 +131,7 @@ def test_every_system_runs_on_either(name, equal, key, monkeypatch):
 
     own = episodes()
     seen = []
-    for module in [m for n, m in sys.modules.items() if n.startswith("jast.simulators")]:
+    for module in [m for n, m in sys.modules.items() if n.startswith("jast._src.simulators")]:
         for attribute, value in list(vars(module).items()):
             if value is D:
                 monkeypatch.setattr(module, attribute, Distrax())

@@ -13,7 +13,6 @@ from hypothesis import strategies as st
 import jast
 from jast import distributions as D
 from jast._src.core.episode import _rollout, play_back
-from jast._src.simulators import fms
 from jast._src.simulators.fms import (
     FIXES,
     KLAX,
@@ -25,7 +24,7 @@ from jast._src.simulators.fms import (
     events,
     system,
 )
-from jast.simulators import fms_misses, fms_path
+from jast.simulators import fms, fms_misses, fms_path
 
 pytestmark = pytest.mark.usefixtures("x64")
 NMI, FOOT = 1852.0, 0.3048

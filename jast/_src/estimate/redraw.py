@@ -68,7 +68,13 @@ def redraw_chunk(key: Any, i: int, sim: Any, q: Any, n: int, lanes: int) -> np.n
     """The first ``n`` points, or more, of the ``lanes`` of chunk ``i`` of an estimate with the
     draws of ``q``, which may be "model". On the host.
     """
-    return _REDRAW_CHUNK[type(q)](key, i, sim, q, n, lanes)
+    if isinstance(q, str):
+        return plain_chunk(key, i, n, sim)
+    if isinstance(q, Sample):
+        return q.points[i * lanes : i * lanes + n]
+    if isinstance(q, tilts.Tilts):
+        return redraw(numpy_generator(key, 2, i), sim, q, lanes)[0]
+    return latent.place(q, *numbers_of_chunk(key, i, n, q))
 
 
 def redraw_failures(
@@ -117,35 +123,22 @@ def _choose_failures(key, sim, sample, n):
 
 
 _REDRAW = {latent.Latent: _redraw_gaussians, tilts.Tilts: _redraw_tilts, Sample: _choose_failures}
-_REDRAW_CHUNK = {
-    str: lambda key, i, sim, q, n, lanes: plain_chunk(key, i, n, sim),
-    latent.Latent: lambda key, i, sim, q, n, lanes: latent.place(
-        q, *numbers_of_chunk(key, i, n, q)
-    ),
-    tilts.Tilts: lambda key, i, sim, q, n, lanes: redraw(numpy_generator(key, 2, i), sim, q, lanes)[
-        0
-    ],
-    Sample: lambda key, i, sim, q, n, lanes: q.points[i * lanes : i * lanes + n],
-}
 
 
 @jit
 def _episodes_of_traces(sim, trace):
     """The `jast.Episode` of each of these traces, without states."""
 
-    def one(first, steps):
+    def one(trace):
         def start():
-            x0 = tilts.assemble(parts(sim.start()), first.first_normals, first.first_choices)
+            x0 = tilts.assemble(parts(sim.start()), trace.first_normals, trace.first_choices)
             return D.Deterministic(x0)
 
         def disturbance(s, t):
-            z, i = steps.normals[t], steps.choices[t]
+            z, i = trace.normals[t], trace.choices[t]
             return D.Deterministic(tilts.assemble(parts(sim.disturbance(s)), z, i))
 
         policy = Policy(start, disturbance)
         return rollout(jax.random.key(0), sim, policy)._replace(states=None)
 
-    rows = tilts.Trace(
-        first_normals=0, first_choices=0, first_log_p=0, seen=1, normals=1, choices=1, log_p=1
-    )
-    return jax.vmap(one, (rows, rows))(trace, trace)
+    return jax.vmap(one)(trace)
