@@ -27,8 +27,8 @@ from benchmarks.sizes import (
     timed,
 )
 from jast._src.core.counter_prng import tree_keys
-from jast._src.simulators.colav import SCENARIOS, colav
 from jast._src.util.intervals import clopper_pearson
+from jast.simulators.colav import SCENARIOS, colav
 
 REWARD = jast.rewards.standard(event_bonus=200.0, density="mode")
 PRUNES = 22  # published

@@ -17,8 +17,8 @@ import numpy as np
 
 import jast
 from benchmarks.sizes import options, print_report, printer, size, timed
-from jast._src.simulators.fms import MEANS, SIGMAS, fms
 from jast.distributions import Independent, Normal
+from jast.simulators.fms import MEANS, SIGMAS, fms
 
 EVALUATIONS = 5000
 # Table 3.3, one seed: failures, first failure, mean and standard deviation of d, least d

@@ -24,7 +24,7 @@ import numpy as np
 
 from benchmarks.fms import quantiles, spread
 from benchmarks.sizes import options, print_report, printer, size
-from jast._src.simulators.fms import MEANS, SIGMAS, fms
+from jast.simulators.fms import MEANS, SIGMAS, fms
 
 READINGS = ("episode", "root", "level", "edge", "visited", "none")
 DEPTH = 12  # waypoints of a route

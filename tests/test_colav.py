@@ -26,7 +26,7 @@ from jast import distributions as D
 from jast._src.core.episode import _rollout, play_back
 from jast._src.core.rewards import STANDARD
 from jast._src.plot.colav import zone_outline
-from jast._src.simulators.colav import SCENARIOS, Scenario, planner, tracker, vessels
+from jast._src.simulators.colav import planner, tracker, vessels
 from jast._src.simulators.colav.planner import DESIRED, SPEEDS, ZONES, inside
 from jast._src.simulators.colav.tracker import Track
 from jast._src.simulators.colav.vessels import (
@@ -39,6 +39,7 @@ from jast._src.simulators.colav.vessels import (
 )
 from jast.rewards import as_pytree
 from jast.simulators import colav
+from jast.simulators.colav import SCENARIOS, Scenario
 
 KINDS = ("delay", "steering", "noise")
 STEPS, SUBSTEPS, STEP = 25, 30, 3.0

@@ -13,18 +13,9 @@ from hypothesis import strategies as st
 import jast
 from jast import distributions as D
 from jast._src.core.episode import _rollout, play_back
-from jast._src.simulators.fms import (
-    FIXES,
-    KLAX,
-    KSFO,
-    MEANS,
-    SIGMAS,
-    FmsState,
-    database,
-    events,
-    system,
-)
+from jast._src.simulators.fms import database, events, system
 from jast.simulators import fms, fms_misses, fms_path
+from jast.simulators.fms import FIXES, KLAX, KSFO, MEANS, SIGMAS, FmsState
 
 pytestmark = pytest.mark.usefixtures("x64")
 NMI, FOOT = 1852.0, 0.3048

@@ -12,8 +12,9 @@ from pictures import drawn, matplotlib, plt
 import jast
 from jast import plot
 from jast._src.plot.colav import zone_outline
-from jast._src.simulators.colav import SCENARIOS, colav, planner
+from jast._src.simulators.colav import planner
 from jast._src.simulators.colav.tracker import PERIOD
+from jast.simulators.colav import SCENARIOS, colav
 
 SIM = colav("sharp turn")
 EPISODE = jast.replay(SIM, jnp.linspace(0.1, 0.6, 25))

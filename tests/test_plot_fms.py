@@ -11,8 +11,8 @@ from pictures import drawn, plt
 import jast
 from jast import plot
 from jast._src.search.result import Trials
-from jast._src.simulators.fms import KLAX, KSFO
 from jast.simulators import fms, fms_path, walk1d
+from jast.simulators.fms import KLAX, KSFO
 
 
 def lines(ax, label):

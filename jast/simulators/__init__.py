@@ -3,9 +3,7 @@ a picture of a state of some of them."""
 
 from jast._src.simulators.autoregression import autoregression
 from jast._src.simulators.bluesky import bluesky, bluesky_flight
-from jast._src.simulators.colav import colav
 from jast._src.simulators.ferry import ferry
-from jast._src.simulators.fms import fms, fms_misses, fms_path
 from jast._src.simulators.landing import landing, landing_probability
 from jast._src.simulators.limit_state import limit_state
 from jast._src.simulators.pendulum import pendulum
@@ -13,6 +11,8 @@ from jast._src.simulators.ruin import ruin, ruin_probability
 from jast._src.simulators.svg_states import draw
 from jast._src.simulators.walk import walk1d
 from jast.simulators import arch
+from jast.simulators.colav import colav
+from jast.simulators.fms import fms, fms_misses, fms_path
 
 __all__ = [
     "arch",

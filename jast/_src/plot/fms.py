@@ -15,7 +15,7 @@ import numpy as np
 from jast._src.core.episode import Episode
 from jast._src.core.simulator import Simulator
 from jast._src.plot import style
-from jast._src.simulators.fms import FIXES, KLAX, KSFO
+from jast._src.simulators.fms.database import FIXES, KLAX, KSFO
 from jast._src.simulators.fms.events import EVENTS, FOOT, extent
 from jast._src.simulators.fms.geodesic import direct, inverse
 from jast._src.simulators.fms.lateral import NMI
