@@ -95,11 +95,9 @@ def test_the_kept_tail_is_enough(n):
     """k-hat from the stream is k-hat of all weights."""
     log_w = np.random.default_rng(n).normal(size=n) * 2
     total = summed(log_w, [n // 3, n // 2])
-    assert (
-        estimate_from_weights("x", total).k_hat == pareto_k(log_w, n)
-        and (np.diff(total.tail) <= 0).all()
-        and len(total.tail) <= total.keep < n
-    )
+    assert estimate_from_weights("x", total).k_hat == pareto_k(log_w, n)
+    assert (np.diff(total.tail) <= 0).all()
+    assert len(total.tail) <= total.keep < n
 
 
 def test_extreme_weights():
@@ -112,19 +110,15 @@ def test_extreme_weights():
     assert (total.failures, total.undefined, total.top) == (9, 0, 1500 + np.log(3))
     assert (total.first, total.second) == pytest.approx((4 / 3, 10 / 9))
     found = estimate_from_weights("x", summed(log_w - 3000, [3, 10, 12], failure=failure))
-    assert (
-        found.mean == 0
-        and found.log_mean == pytest.approx(-1500 + np.log(4 / 14))
-        and np.isfinite(found.relative_error)
-        and "10^-65" in str(found)
-    )
+    assert found.mean == 0
+    assert found.log_mean == pytest.approx(-1500 + np.log(4 / 14))
+    assert np.isfinite(found.relative_error)
+    assert "10^-65" in str(found)
     only = summed(np.full(4, -np.inf))
-    assert (
-        only.first == 0
-        and only.failures == 4
-        and not estimate_from_weights("x", only).reliable
-        and np.isnan(estimate_from_weights("x", only).mean)
-    )
+    assert only.first == 0
+    assert only.failures == 4
+    assert not estimate_from_weights("x", only).reliable
+    assert np.isnan(estimate_from_weights("x", only).mean)
 
 
 def test_weights_that_are_not_numbers():
@@ -140,10 +134,8 @@ def test_weights_that_are_not_numbers():
     assert (total.failures, total.undefined, total.invalid) == (4, 2, 1)
     assert total.first == pytest.approx(1 + np.exp(-1)) and np.isfinite(total.by_component).all()
     found = estimate_from_weights("x", total)
-    assert (
-        "2 failing episodes have a weight that is NaN or infinite" in found.warnings
-        and "1 of 6 episodes are invalid" in found.warnings[-1]
-    )
+    assert "2 failing episodes have a weight that is NaN or infinite" in found.warnings
+    assert "1 of 6 episodes are invalid" in found.warnings[-1]
 
 
 # The Pareto shape
@@ -267,11 +259,9 @@ def test_one_episode_carries_it():
     found = estimate_from_weights(
         "x", summed(log_w + 0.01 * np.random.default_rng(0).normal(size=1000))
     )
-    assert (
-        not found.reliable
-        and found.max_share == pytest.approx(0.5, abs=0.01)
-        and any("one episode carries 50%" in w for w in found.warnings)
-    )
+    assert not found.reliable
+    assert found.max_share == pytest.approx(0.5, abs=0.01)
+    assert any("one episode carries 50%" in w for w in found.warnings)
 
 
 def test_thin_modes():
@@ -307,31 +297,23 @@ def test_printing():
     """UNRELIABLE and why in the first line, or nothing of the kind; remarks at the end."""
     good = estimate_from_weights("importance", some(), notes=("interrupted",))
     lines = str(good).splitlines()
-    assert (
-        good.reliable
-        and lines[0].split() == ["method", "importance"]
-        and lines[-1].split() == ["remark", "interrupted"]
-        and "UNRELIABLE" not in str(good)
-    )
-    assert (
-        f"{good.mean:.4g}" in lines[1]
-        and "0.95 interval [" in lines[1]
-        and "2000 of 4000 episodes" in str(good)
-        and "k-hat" in str(good)
-    )
+    assert good.reliable
+    assert lines[0].split() == ["method", "importance"]
+    assert lines[-1].split() == ["remark", "interrupted"]
+    assert "UNRELIABLE" not in str(good)
+    assert f"{good.mean:.4g}" in lines[1]
+    assert "0.95 interval [" in lines[1]
+    assert "2000 of 4000 episodes" in str(good)
+    assert "k-hat" in str(good)
     bad = estimate_from_weights(
         "importance", some(), reasons=("it was Friday",), notes=("interrupted",)
     )
-    assert (
-        str(bad).startswith("UNRELIABLE: it was Friday")
-        and bad.warnings == ("it was Friday", "interrupted")
-        and not bad.reliable
-    )
-    assert (
-        bad.mean == good.mean
-        and good.interval[0] < good.mean < good.interval[1]
-        and good.log10_mean == pytest.approx(np.log10(good.mean))
-    )
+    assert str(bad).startswith("UNRELIABLE: it was Friday")
+    assert bad.warnings == ("it was Friday", "interrupted")
+    assert not bad.reliable
+    assert bad.mean == good.mean
+    assert good.interval[0] < good.mean < good.interval[1]
+    assert good.log10_mean == pytest.approx(np.log10(good.mean))
     assert "invalid" in str(estimate_from_weights("x", some(invalid=np.arange(4000) == 1)))
 
 
@@ -340,24 +322,18 @@ def test_counts():
     total = summed(np.zeros(50), failure=np.arange(50) < 10)
     found = estimate_from_counts("monte_carlo", total, level=0.9)
     tail = scipy.stats.beta.ppf([0.05, 0.95], [10, 11], [41, 40])
-    assert (
-        found.mean == 0.2
-        and found.relative_error == pytest.approx(np.sqrt(0.8 / 10))
-        and found.interval == pytest.approx(tuple(tail), rel=1e-5)
-    )
-    assert (
-        found.reliable
-        and found.level == pytest.approx(0.9)
-        and "Chernoff" in str(found)
-        and found.chernoff > found.jeffreys > 0.2
-    )
+    assert found.mean == 0.2
+    assert found.relative_error == pytest.approx(np.sqrt(0.8 / 10))
+    assert found.interval == pytest.approx(tuple(tail), rel=1e-5)
+    assert found.reliable
+    assert found.level == pytest.approx(0.9)
+    assert "Chernoff" in str(found)
+    assert found.chernoff > found.jeffreys > 0.2
     everything = estimate_from_counts("monte_carlo", summed(np.zeros(50)))
-    assert (
-        everything.mean == 1
-        and everything.interval[1] == 1
-        and everything.relative_error == 0
-        and everything.chernoff == 1
-    )
+    assert everything.mean == 1
+    assert everything.interval[1] == 1
+    assert everything.relative_error == 0
+    assert everything.chernoff == 1
 
 
 @pytest.mark.parametrize(
@@ -428,16 +404,16 @@ def test_no_probability_above_1():
     assert found.reliable and (found.mean, found.log_mean) == (1.0, 0.0)
     assert found.interval[0] < 1 == found.interval[1] and "probability    1   0.95" in str(found)
     wrong = estimate_from_weights("x", summed(log_w + 1), plain=(9, 0, 10))
-    assert not wrong.reliable and wrong.mean == 1 and "is 2.721, above 1" in wrong.warnings[0]
+    assert not wrong.reliable
+    assert wrong.mean == 1
+    assert "is 2.721, above 1" in wrong.warnings[0]
     assert "doubtful       1   0.95 interval" in str(wrong)
 
 
 def test_the_level_is_the_one_that_was_asked_for():
     """Also where JAX's numbers are single."""
-    assert (
-        estimate_from_weights("x", some(), level=0.95).level == 0.95
-        and estimate_from_counts("x", some(), level=0.95).level == 0.95
-    )
+    assert estimate_from_weights("x", some(), level=0.95).level == 0.95
+    assert estimate_from_counts("x", some(), level=0.95).level == 0.95
 
 
 def test_coverage_of_the_interval():

@@ -92,10 +92,8 @@ def test_large_numbers_are_read_at_a_glance(log10, words):
 
 
 def test_a_share_of_the_runs():
-    assert (
-        share_of_runs(np.log10(0.25)) == "25 % of the runs"
-        and share_of_runs(-2) == "one of 100 runs"
-    )
+    assert share_of_runs(np.log10(0.25)) == "25 % of the runs"
+    assert share_of_runs(-2) == "one of 100 runs"
 
 
 def test_what_is_copied_replays_to_the_bit(page, tmp_path, monkeypatch, capsys):

@@ -93,10 +93,8 @@ def test_what_cannot_be_traced_compiles_apart(of, limits, n):
 
 def test_simulators_of_one_kind_are_taken_as_they_are():
     sims = [jast.simulators.walk1d(threshold=v) for v in (3.0, 4.0)]
-    assert (
-        all(a is b for a, b in zip(make_simulators(sims, [{}, {}]), sims))
-        and count_kinds(sims) == 1
-    )
+    assert all(a is b for a, b in zip(make_simulators(sims, [{}, {}]), sims))
+    assert count_kinds(sims) == 1
     shared = lambda limit: jast.simulators.walk1d(threshold=limit)
     made = make_simulators(shared, [{"limit": 3.0}, {"limit": 4.0}])
     assert made[0].evaluate.func is sims[0].evaluate.func

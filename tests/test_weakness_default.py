@@ -296,11 +296,9 @@ def test_wide_inputs_are_seen_by_their_components(monkeypatch):
     data = Data(wide, np.zeros(200, np.int32), 2)
     reduced = features.reduce_inputs(np.random.default_rng(1), data)
     seen_as = features.make_views(data, reduced)
-    assert (
-        seen_as.scaled.shape == (200, 4)
-        and np.abs(seen_as.scaled).max() == pytest.approx(1)
-        and seen_as.centred.std() == pytest.approx(0.4, rel=1e-4)
-    )
+    assert seen_as.scaled.shape == (200, 4)
+    assert np.abs(seen_as.scaled).max() == pytest.approx(1)
+    assert seen_as.centred.std() == pytest.approx(0.4, rel=1e-4)
     flat = wide.reshape(200, -1) - wide.reshape(200, -1).mean(0)
     true = np.linalg.svd(flat, full_matrices=False)[0][:, :3]
     ours = np.linalg.qr(reduced[:, :3].astype(float))[0]

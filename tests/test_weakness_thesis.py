@@ -54,13 +54,11 @@ def leaky(x):
 
 
 def test_default_widths():
-    assert (
-        default_widths(784) == (392, 64)
-        and default_widths(5000) == (392, 64)
-        and default_widths(64) == (32, 16)
-        and default_widths(20) == (10, 5)
-        and default_widths(1) == (1, 1)
-    )
+    assert default_widths(784) == (392, 64)
+    assert default_widths(5000) == (392, 64)
+    assert default_widths(64) == (32, 16)
+    assert default_widths(20) == (10, 5)
+    assert default_widths(1) == (1, 1)
 
 
 @pytest.mark.parametrize(
