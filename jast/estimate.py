@@ -1,5 +1,5 @@
-"""Failure probabilities: importance resampling of failure traces and failure policies, and
-estimators that find their own proposal.
+"""How probable is a failure? `failure_probability` chooses a method by what an episode costs; the
+others are single methods, and what more can be asked of an estimate.
 """
 
 from jast._src.estimate.diagnostics import pareto_k

@@ -1,4 +1,4 @@
-"""Learned failure policies: who is taught to make a system fail, in its likeliest ways."""
+"""Failure policies: trained by reinforcement learning to make a system fail in likely ways."""
 
 from jast._src.policies.failure_policy import FailurePolicy, History
 from jast._src.policies.proximal_policy import ppo

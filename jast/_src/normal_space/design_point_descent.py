@@ -24,8 +24,9 @@ __all__ = ["Descents", "EPISODES", "STEPS", "descents", "differentiable"]
 STEPS = 12  # of a descent
 HALVINGS = 5  # of the way back to the boundary, in each step
 EPISODES = STEPS * (HALVINGS + 1)  # of a descent, beside `STEPS` that are differentiated
-FARTHER = 1.5  # times as far out as the last step, which may be 0, so with
-FIRST = 3  # more, a step may end: a linear extrapolation of a curved function can be wild
+# a step ends at most at FARTHER |z| + FIRST: a linear extrapolation can be wild
+FARTHER = 1.5
+FIRST = 3  # for a start at the origin
 BEYOND = 1.0 + 1e-4  # of the boundary, so that rounding leaves failures failures
 
 
@@ -37,9 +38,9 @@ class Descents(NamedTuple):
     found: jax.Array
     """bool: there is one."""
     nearest: jax.Array
-    """[D] the point of least distance among those that were differentiated, and"""
+    """[D] the point of least distance among those that were differentiated."""
     distance: jax.Array
-    """its distance; inf where none is valid."""
+    """The distance there; inf where none is valid."""
     useful: jax.Array
     """int32: how many of the gradients led somewhere."""
     failing: jax.Array
@@ -49,9 +50,9 @@ class Descents(NamedTuple):
     first: jax.Array
     """int32: the step, from 0 on, of which the first failure was; `STEPS` where none was."""
     slopes: jax.Array
-    """int32: simulator steps of the episodes that were differentiated, and"""
+    """int32: simulator steps of the episodes that were differentiated."""
     steps: jax.Array
-    """int32: those of the others."""
+    """int32: simulator steps of the others."""
 
 
 @jit

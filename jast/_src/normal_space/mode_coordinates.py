@@ -63,8 +63,9 @@ class Centred(Distribution):
 
 
 def centred(sim: Simulator) -> Simulator:
-    """``sim`` with `Centred` distributions: the same episodes, told by other numbers. Distributions
-    without a mode, or whose mode is 0 already, stay as they are: they share compiled programs.
+    """``sim`` with `Centred` distributions: the same episodes, in coordinates from the mode.
+    Distributions without a mode, or whose mode is 0 already, stay as they are: they share compiled
+    programs.
     """
     about = outline(sim)
     changes = {}

@@ -29,15 +29,15 @@ from jast._src.search.result import SearchResult
 __all__ = ["Calibration", "calibrate", "with_calibration"]
 
 EPISODES = 128
-"""Of a batch."""
+"""Episodes of a batch."""
 HOSTED_EPISODES = 10
-"""Of a batch of a system on the host, where episodes are dear."""
+"""Episodes of a batch of a system on the host, where they are dear."""
 WIDTHS = 1.0, 1.5, 2.0, 3.0, 4.0, 6.0
-"""That are tried, in this order."""
+"""Widths of the noise that are tried, in this order."""
 FAILING_SHARE = 0.01
-"""From which no wider noise is tried: more noise found less likely failures."""
+"""Share of failing episodes from which no wider noise is tried: that found less likely failures."""
 NEAR_SHARE = 0.1
-"""Of the episodes: where none fails, that width is taken of which these come nearest."""
+"""Share of the episodes: where none fails, that width is taken of which these come nearest."""
 
 
 class Calibration(NamedTuple):

@@ -38,13 +38,13 @@ __all__ = [
 MAX_FAILURES = 128
 """Failures that an explorer hands over, the most."""
 PRUNES = 18
-"""Of a tree: 10 with more simulations each found failures of `jast.simulators.colav` in half as
-many trees.
+"""Prunes of a tree: 10 with more simulations each found failures of `jast.simulators.colav` in half
+as many trees.
 """
 TREE_EVALUATIONS = 2500
 """Evaluations for each tree of a forest, and at most as many trees as below."""
 MAX_TREES = 64
-"""Of a forest; a forest with more would prune too rarely."""
+"""Trees of a forest; one with more would prune too rarely."""
 COOLED_EVALUATIONS = 84
 """Evaluations for each failure that is cooled: its wide draws, and a move at each width."""
 LEVEL_EVALUATIONS = 12
@@ -56,7 +56,7 @@ DESCENT_EVALUATIONS = 108
 DESCENTS = 4, 48
 """Least and greatest number of them."""
 ITERATIONS = 15
-"""Of the cross-entropy method."""
+"""Iterations of the cross-entropy method."""
 SLOW_ITERATIONS = 30
 """Iterations of `slow_cross_entropy`: half of them with twice the draws ends in worse basins."""
 SLOW_WIDTH = 0.5

@@ -18,8 +18,8 @@ __all__ = ["draw_model", "explore_failures"]
 
 LIFTS = 1.0, 1.05, 1.1, 1.2  # times as far out as a failure, where its mirror image is tried
 FAR_POINTS = 16  # above which the least weights of design points far out fall with their number
-POPULATION_PART = 100  # of a budget, of which a population's points are one part, but
-POPULATION_LEAST = 100  # no fewer
+POPULATION_PART = 100  # a population has a hundredth of the budget as points
+POPULATION_LEAST = 100  # and at least so many
 POPULATION_SHARE = 0.4  # of what is left, that a population may cost
 
 

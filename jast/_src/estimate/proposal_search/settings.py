@@ -107,8 +107,8 @@ class SearchSettings(NamedTuple):
     variance_least: float = 0.3
     """Least variance, the model's being 1, of what an audit takes in."""
     direction_share_least: float = 0.05
-    """Share of a direction at the least, and the part of an even share from which a component
-    counts as one: the mass that few failures tell is mostly too small."""
+    """Least share of a direction, and the part of an even share from which a component counts as
+    one: few failures mostly underestimate a share."""
     directions_share_least: float = 0.2
     """Share of all directions together at the least."""
     group_share_least: float = 0.1
@@ -155,7 +155,7 @@ class SearchSettings(NamedTuple):
     uncovered_share: float = 0.06
     """Part of the probability, by the batches, that may be uncovered."""
     coverage_draws: int = 20
-    """Draws that so great a part is to have, wherever it is covered."""
+    """Draws that a part of that share must have met to count as covered."""
     uncovered_ess: int = 10
     """Effective draws of the batches with which an uncovered part is known well enough."""
     audit_share: float = 0.15

@@ -42,27 +42,27 @@ __all__ = [
 ]
 
 RAY_LENGTHS = 8, 4, 2, 1, 0.5, 0.25
-"""Of the rays, as shares of the gap."""
+"""Lengths of the rays, as shares of the gap."""
 SLOPE_LENGTHS = 2.5, 1, 0.4
-"""Of the steps along the boundary, as shares of the length."""
+"""Lengths of the steps along the boundary, as shares of ``Point.length``."""
 RAISED = 0, 0.1, 0.3, 0.6
 """How far each of them is lifted for a boundary that bends, as shares of the angle of the step."""
 WIDTHS = 3, 1, 0.3, 0.1, 3, 1, 0.3, 0.1
-"""Of the walks, as shares of the width."""
+"""Widths of the random steps, as shares of ``Point.width``."""
 RAYS = len(RAY_LENGTHS)
-"""Candidates of a point in a round that are rays; likewise"""
+"""Candidates of a point in a round that are rays."""
 SLOPES = len(SLOPE_LENGTHS) * len(RAISED)
-"""steps along the boundary,"""
+"""Those that are steps along the boundary."""
 WALKS = len(WIDTHS)
-"""walks (beside the last step that paid),"""
+"""Those that are random steps, without the last step that paid."""
 REMOVALS = 6
-"""removals,"""
+"""Those that are removals of numbers."""
 EXCHANGES = 8
-"""exchanges,"""
+"""Those that exchange numbers."""
 SHIFTS = 4
-"""and shifts in time."""
+"""Those that are shifts in time."""
 SIZE = RAYS + SLOPES + WALKS + 1 + REMOVALS + EXCHANGES + SHIFTS
-"""Candidates of a point in a round."""
+"""All candidates of a point in a round."""
 NEAREST = 1e-6
 """The least gap, and the least of what is divided by."""
 FARTHEST = 0.5
@@ -90,9 +90,9 @@ class Point(NamedTuple):
     last: np.ndarray
     """[n, D] the last step that paid."""
     slope: np.ndarray
-    """[n, D] of the distance, and"""
+    """[n, D] the gradient of the distance at the last round."""
     rise: np.ndarray
-    """[n, D] of the cost, both at the last round."""
+    """[n, D] the gradient of the cost at the last round."""
 
 
 class Noise(NamedTuple):

@@ -37,12 +37,13 @@ RARER = 1.0
 BENT = 0.1
 """How far beside the line a path may bend, as a share of the way from the origin."""
 MOVES = 2
-"""In which it does."""
+"""Moves of the points of a path that is bent."""
 TRIALS = 8
-"""Each the best of so many. Of the failures of the ferry straight paths make 10, 13 and
-11 modes (three keys, 6,000 evaluations at most) and these one (14,300 at most); of the ship's 12
-and 7 (within 12,500: 7, 8 with four moves, 9 with one move or six trials). The two of the lane and
-of the arm, four branches and the 14 found of "2 of 10" and of "series 60, turned" stay apart.
+"""Candidates of a move, of which the best is taken. Of the failures of the ferry straight paths
+make 10, 13 and 11 modes (three keys, 6,000 evaluations at most) and these one (14,300 at most); of
+the ship's 12 and 7 (within 12,500: 7, 8 with four moves, 9 with one move or six trials). The two of
+the lane and of the arm, four branches and the 14 found of "2 of 10" and of "series 60, turned" stay
+apart.
 """
 PAIRS = 32
 """Paths looked for at a time, of all modes."""

@@ -44,11 +44,11 @@ SAME_PLACE = 0.02
 SMALL_GAIN = 1e-6
 """Share of its cost, less than which a point gained in `PATIENCE` looks once it has arrived."""
 PATIENCE = 6
-"""Looks."""
+"""Looks without gain before a point has converged."""
 STARTING = 0.5
 """Share of the budget in which further failures are started with."""
 MIN_ROUNDS = 15
-"""That are left for each of them; fewer would not bring it near its end."""
+"""Rounds that a further failure must still get; fewer would not bring it near its end."""
 ALIKE = 0.7
 """In the rest, of points with at least this cosine only the likeliest goes on."""
 LIFTS = np.array([0.0, 1e-6, 1e-5, 1e-4, 1e-3, 1e-2])
