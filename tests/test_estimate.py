@@ -141,6 +141,15 @@ def test_weights_that_are_not_numbers():
 # The Pareto shape
 
 
+@pytest.mark.parametrize("far", [-300.0, -1000.0])
+def test_an_invalid_episode_of_far_greater_weight_is_flagged(far):
+    """The third power of the weight of the failure, or the weight itself, is 0 beside it."""
+    total = summed(np.array([far, 0.0]), failure=np.arange(2) == 0, invalid=np.arange(2) == 1)
+    found = estimate_from_weights("x", total)
+    assert not found.reliable
+    assert "invalid" in str(found)
+
+
 def psis_k(log_w, n):
     """Zhang and Stephens' estimate of the shape of the tail with PSIS's prior, step by step as
     Vehtari et al. 2024, appendix C has it.

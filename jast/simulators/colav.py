@@ -5,10 +5,6 @@ The S1 of Lytskjold and Mengshoel (the mA2 ferry with its collision avoidance) i
 system has its shape, not its numbers: the published starts and routes, zones, penalties, gains,
 speed range and disturbances, on a published vessel model; what was not published is ours, and says
 so where it stands. Measured rates and what the searches find: ``python -m benchmarks.colav``.
-
-`scenarios`: the encounters as data; `vessels`: dynamics and control; `tracker`: the past that
-delays refer to, and what the ferry makes of it; `planner`: safety zones and speed; `system`: all of
-it as a `jast.Simulator`.
 """
 
 from jast._src.simulators.colav.scenarios import SCENARIOS, Scenario

@@ -1,5 +1,5 @@
 """The rows of the normal family, of the containers and of one of two classes; those of other
-families are in `rows`. Each serves distrax's class of that name, too.
+families are in `distrax_rows`. Each serves distrax's class of that name, too.
 """
 
 from collections.abc import Callable

@@ -4,7 +4,6 @@ precision, any range.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -119,7 +118,8 @@ def add_traces(total: Sums, traces: Any, plain: np.ndarray | None = None) -> Sum
 
 def moments(sums: Sums) -> Moments:
     """`Moments` of the weights, where a failure was seen."""
-    log_sums = [math.log(v) for v in (sums.first, sums.second, sums.third)]
+    with np.errstate(divide="ignore"):  # far below the greatest weight of an invalid one: 0
+        log_sums = np.log([sums.first, sums.second, sums.third]).tolist()
     m = moments_of_sums(log_sums, sums.samples)
     return m._replace(log_mean=m.log_mean + sums.top)
 

@@ -118,8 +118,8 @@ def user_cell(cell: Callable[..., jax.Array], cells: int) -> CellOf:
 
 @functools.cache
 def greedy_actor(cell: CellOf, horizon: int) -> Partial:
-    """The table as a function of the networks' inputs, in the form of `actor_network`: one normal
-    distribution of the latents around the best action.
+    """The table as a function of the networks' inputs, in the form of an actor of `make_networks`:
+    one normal distribution of the latents around the best action.
     """
 
     def apply(table, inputs):

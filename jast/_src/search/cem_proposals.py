@@ -49,7 +49,7 @@ def copy_steps(key, values, lengths, fresh, part):
 
 
 def make_draw(kind, actions, anew):
-    """``(key, row, distribution) -> disturbance``, the row being z, or a pair of `copies`;
+    """``(key, row, distribution) -> disturbance``, the row being z, or a pair of `copy_steps`;
     ``anew(key, distribution)`` draws where there is nothing to copy.
     """
 

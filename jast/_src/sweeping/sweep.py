@@ -70,8 +70,8 @@ def sweep(
             simulators.
         values: name of a setting -> its N values. Names and numbers only label the rows where
             simulators are given.
-        function: ``function(key, simulator, **options)`` returns an `Estimate`, a `jast.Nominal`, a
-            `SearchResult`, a `Report`, or anything else, which is kept.
+        function: ``function(key, simulator, **options)`` returns an `Estimate`, the result of
+            `jast.nominal`, a `SearchResult`, a `Report`, or anything else, which is kept.
         follow: whether each row starts from the one before: ``function`` is also given ``near``,
             the last result. `jast.estimate.failure_probability` then looks for no proposal of its
             own where that of the neighbour serves; its draws are new. So put values in order.
@@ -159,7 +159,7 @@ def sweep(
 
 
 def _join(function, rows, found):
-    """The `Joined` of the rows that are done, where they are one kind of cheap systems."""
+    """The `Curve` of the rows that are done, where they are one kind of cheap systems."""
     if function is not failure_probability or count_kinds(rows.made) > 1:
         return None
     try:

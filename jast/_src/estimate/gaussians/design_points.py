@@ -1,5 +1,5 @@
 """Most probable failure points by gradients: the points of least norm on the boundary of failure,
-from many starts (`jast.boundary`).
+from many starts (`normal_space.design_point_descent`).
 """
 
 import math

@@ -91,10 +91,12 @@ def _equilibrate_cooled(family, state):
         return state, None
     key, everywhere = family.context.next_key(), family.exclusion(state.q, math.inf)
     moves = settings.burn_in_moves
-    people, chain = equilibrate(key, family.sim, z, moves, covered=everywhere, max_evaluations=most)
-    rows = people.score == -np.inf
-    state = state.note(f"audit: {len(z)} failures of wide noise moved", chain.evaluations)
-    return family.as_points(state, people.z[rows], people.used[rows])
+    population, sampler = equilibrate(
+        key, family.sim, z, moves, covered=everywhere, max_evaluations=most
+    )
+    rows = population.score == -np.inf
+    state = state.note(f"audit: {len(z)} failures of wide noise moved", sampler.evaluations)
+    return family.as_points(state, population.z[rows], population.used[rows])
 
 
 def _missing(family, state, cooled):

@@ -152,10 +152,10 @@ def _equilibrate(f, state, z, chains=1):
     """
     key, everywhere = f.context.next_key(), f.exclusion(f.untilted(), math.inf)
     starts, moves = np.repeat(z, chains, axis=0), f.settings.burn_in_moves
-    people, chain = equilibrate(key, f.sim, starts, moves, covered=everywhere)
+    population, sampler = equilibrate(key, f.sim, starts, moves, covered=everywhere)
     places = len(np.unique(z, axis=0))
-    state = state.note(f"failures given: around {places} of them", chain.evaluations)
-    return _failing(f, state, people.z)
+    state = state.note(f"failures given: around {places} of them", sampler.evaluations)
+    return _failing(f, state, population.z)
 
 
 def _failing(f, state, z):

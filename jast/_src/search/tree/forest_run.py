@@ -66,7 +66,7 @@ class Job(NamedTuple):
     """What was asked for, for the result; None in a traced search."""
     calibration: Calibration | None = None
     """The episodes that gave the scales."""
-    school: HeadTraining | None = None
+    training: HeadTraining | None = None
     """The heads, where there are any."""
     head_settings: HeadSettings | None = None
 
@@ -153,13 +153,13 @@ def grow_trees(
             first = store.choose_once(lambda: dict(memoize=fitted.memoize, lanes=lanes))
             fitted, lanes = fitted._replace(memoize=first["memoize"]), first["lanes"]
         job = job._replace(plan=fitted)
-        ran, school = grow_rounds(job, key, threads, lanes, watch, ways._replace(store=store))
+        ran, training = grow_rounds(job, key, threads, lanes, watch, ways._replace(store=store))
     settings = job.settings | dict(prunes=job.plan.prunes, memoize=job.plan.memoize)
-    if job.school is not None:
+    if job.training is not None:
         settings |= _settings_of_heads(heads, job)
     if short := work.describe_missing("simulations", ran, watch.done, watch.total):
         settings |= dict(interrupted=short)
-    found = result(job, ran.state, settings, school)
+    found = result(job, ran.state, settings, training)
     return complete(key, job, found, before, job.calibration, ran.incidents)
 
 
@@ -228,15 +228,15 @@ def with_heads(
         head_settings = HEAD_MODES.get(mode, HEAD_MODES["default"])
     head_settings = check_settings(head_settings)
     sim, actions = job.sim, job.problem.choice.actions
-    school = init_heads(jax.random.fold_in(key, job.trees), sim, actions, heads, head_settings)
-    if job.problem.choice.follow and school.value is not None:
+    training = init_heads(jax.random.fold_in(key, job.trees), sim, actions, heads, head_settings)
+    if job.problem.choice.follow and training.value is not None:
         raise ValueError(
             f"{job.method}: follow must be False with a value head, since that judges each child"
             f" by an action drawn for it, received True (mode={mode!r})"
         )
-    problem = job.problem._replace(guide=guide(school.heads, head_settings))
+    problem = job.problem._replace(guide=guide(training.heads, head_settings))
     learns = head_settings.train
-    edges = learns and head_settings.edges == "all" and school.value is not None
+    edges = learns and head_settings.edges == "all" and training.value is not None
     recount = learns and head_settings.counted == "tree"
     if job.settings is None and isinstance(heads, str):
         raise ValueError(
@@ -257,7 +257,7 @@ def with_heads(
             recount=recount,
         ),
         at_once=min(job.trees, head_settings.round or usual) if learns else job.trees,
-        school=school,
+        training=training,
         head_settings=head_settings,
     )
 
@@ -279,7 +279,7 @@ def grow_rounds(
         `runtime.work.UnitsRun` with the batches in the order of the trees, and the heads as they
         are now.
     """
-    problem, school, sim = job.problem, job.school, job.sim
+    problem, training, sim = job.problem, job.training, job.sim
     chunk = max(1, min(job.plan.simulations, HOSTED_CHUNK if runs_on_host(sim) else CHUNK))
     words = np.asarray(jax.random.key_data(tree_keys(key, job.trees)))
     ran = work.UnitsRun((), 0)
@@ -291,17 +291,17 @@ def grow_rounds(
             ran = work.concatenate(ran, new)
             if new.ended is not None:
                 break
-            if school is not None and job.head_settings.train:
+            if training is not None and job.head_settings.train:
                 own = jax.random.fold_in(key, job.trees + 1 + first)
                 actions = problem.choice.actions
-                school = train_heads(own, school, sim, actions, job.head_settings, new.state)
-                problem = problem._replace(guide=guide(school.heads, job.head_settings))
+                training = train_heads(own, training, sim, actions, job.head_settings, new.state)
+                problem = problem._replace(guide=guide(training.heads, job.head_settings))
         except KeyboardInterrupt:
             if not ran.state:
                 raise
             ran = ran._replace(ended="")
             break
-    return ran, school
+    return ran, training
 
 
 def _settings_of_heads(heads: Any, job: Job) -> dict[str, Any]:

@@ -23,9 +23,9 @@ SPARE = 8
 fail."""
 
 
-def result(search: Any, batches: list[TreeBatch], settings: dict, school: Any) -> SearchResult:
+def result(search: Any, batches: list[TreeBatch], settings: dict, training: Any) -> SearchResult:
     """The `SearchResult` of ``batches`` of a search (its ``sim``, ``reward`` and ``top``);
-    ``school``: what the heads learned, or None.
+    ``training``: what the heads learned, or None.
     """
     log, outcome = (
         np.concatenate([getattr(batch, field) for batch in batches], axis=1)
@@ -59,8 +59,8 @@ def result(search: Any, batches: list[TreeBatch], settings: dict, school: Any) -
     return done._replace(
         trees=_beside([b.branches for b in batches]),
         roots=_beside([b.roots for b in batches]),
-        heads=None if school is None else school.heads,
-        lessons=() if school is None else school.lessons,
+        heads=None if training is None else training.heads,
+        lessons=() if training is None else training.lessons,
         misses=_misses(batches, search.top),
     )
 

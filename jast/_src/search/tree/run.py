@@ -109,7 +109,7 @@ class Round(NamedTuple):
 
 
 def grow_all(turn: Round, watch: Watch, ways: work.Placement, threads: int) -> work.UnitsRun:
-    """Grow one tree a key, a group of lanes at a time: `units.UnitsRun` with a tuple of
+    """Grow one tree a key, a group of lanes at a time: `runtime.work.UnitsRun` with a tuple of
     `TreeBatch` in the order of the keys. ``watch`` counts simulations; an interruption ends all
     trees at their next chunk.
     """
