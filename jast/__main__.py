@@ -268,10 +268,11 @@ def _search(key, sim, options, common):
         samples = -(-each // ITERATIONS)
         counts = dict(samples=samples, elites=-(-samples // 10), iterations=ITERATIONS)
         return cem(key, sim, trees=trees, **counts, **common)
-    common |= dict(trees=trees, simulations=each, mode="paper" if options.paper else "default")
+    of_trees = dict(trees=trees, simulations=each, mode="paper" if options.paper else "default")
     if options.method == "mcts":
-        return mcts(key, sim, **common)
-    return forest(key, sim, prunes=options.prunes or 18, heads=options.heads, **common)
+        return mcts(key, sim, **of_trees, **common)
+    prunes = options.prunes or 18
+    return forest(key, sim, prunes=prunes, heads=options.heads, **of_trees, **common)
 
 
 def _shares(results):
