@@ -9,7 +9,6 @@ from pathlib import Path
 
 import jax
 import pytest
-from systems import mark_long
 
 import jast
 from jast import __main__ as cli
@@ -48,9 +47,7 @@ def run(capsys, tmp_path, *argv):
     return status, capsys.readouterr().out, tmp_path / "out"
 
 
-@pytest.mark.parametrize(
-    "method", mark_long(["forest", "mcts", "cem", "monte-carlo"], "forest", "mcts", "cem")
-)
+@pytest.mark.parametrize("method", ["forest", "mcts", "cem", "monte-carlo"])
 def test_every_method_reports_and_saves(capsys, tmp_path, method):
     status, text, out = run(
         capsys, tmp_path, "--method", method, *(["--prunes", "3"] if method == "forest" else [])
