@@ -26,7 +26,7 @@ from benchmarks.limit_states import DYNAMIC, LIMITS, Limit
 from benchmarks.literature import CASES as LITERATURE
 from benchmarks.sizes import add_choices, options, print_report, printer, size, timed
 from jast._src.estimate.host_populations import equilibrate
-from jast._src.normal_space import transform as latent
+from jast._src.normal_space import transform
 from jast._src.normal_space.evaluate_points import judged
 from jast.estimate import failure_probability, failure_samples
 
@@ -71,9 +71,11 @@ def by_rejection(sim: jast.Simulator) -> Callable:
     """Draws failures by drawing until there are enough."""
 
     def draw(rng, n):
-        kept = np.zeros((0, latent.dimension(sim)))
+        kept = np.zeros((0, transform.dimension(sim)))
         while len(kept) < n:
-            z = rng.standard_normal((LANES, latent.dimension(sim)), latent.normal_numbers(sim))
+            z = rng.standard_normal(
+                (LANES, transform.dimension(sim)), transform.normal_numbers(sim)
+            )
             kept = np.concatenate([kept, z[judged(sim, z).failure]])
         return kept[:n]
 
@@ -102,7 +104,7 @@ CASES: dict[str, Callable[[], tuple[jast.Simulator, Callable]]] = {
 
 def _numbers(sim: jast.Simulator, z: Any) -> np.ndarray:
     """[n, D]: 0 where a number decided nothing."""
-    return latent.normal_of(sim, jax.device_get(latent.episodes(sim, z)))
+    return transform.normal_of(sim, jax.device_get(transform.episodes(sim, z)))
 
 
 def ours(key, sim, n, budget):
@@ -110,16 +112,16 @@ def ours(key, sim, n, budget):
     first, second = jax.random.split(key)
     p = failure_probability(first, sim, budget)
     found = failure_samples(second, sim, p, n)
-    return latent.normal_of(sim, found.failures), p.evaluations + found.evaluations
+    return transform.normal_of(sim, found.failures), p.evaluations + found.evaluations
 
 
 def chain(key, sim, n, budget):
     """From the likeliest failure, with as many evaluations."""
     first, second = jax.random.split(key)
     best = jast.search.cem(first, sim, samples=max(budget // 100, 100))
-    start = latent.normal_of(sim, best.failures.episodes)[:1]
+    start = transform.normal_of(sim, best.failures.episodes)[:1]
     if not len(start):
-        return np.full((1, latent.dimension(sim)), np.inf), best.episodes
+        return np.full((1, transform.dimension(sim)), np.inf), best.episodes
     moved, sampler = equilibrate(second, sim, np.repeat(start, n, axis=0), budget // n)
     return _numbers(sim, moved.z), best.episodes + sampler.evaluations
 
@@ -135,7 +137,7 @@ def run(name: str, seeds: int, n: int, budget: int, methods: list[str] | None = 
         function, rows = METHODS[method], []
         for seed in range(seeds):
             rng = np.random.default_rng(seed)
-            true = _numbers(sim, draw(rng, n).astype(latent.normal_numbers(sim)))
+            true = _numbers(sim, draw(rng, n).astype(transform.normal_numbers(sim)))
             key = jax.random.key(seed)
             (found, evaluations), cpu, _ = timed(partial(function, key, sim, n, budget))
             rows.append((*density_and_coverage(true, found), evaluations, cpu))

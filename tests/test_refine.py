@@ -11,7 +11,7 @@ import pytest
 
 import jast
 from benchmarks.stress_systems import CASES, linear
-from jast._src.normal_space import transform as latent
+from jast._src.normal_space import transform
 from jast._src.normal_space.mode_coordinates import centred
 from jast._src.search.refine import refine as refinement
 from jast._src.search.refine.modes import modes
@@ -23,8 +23,8 @@ from jast.search import refine
 
 def draws(sim, scale, n=300, seed=0):
     """Failures of wider noise: an archive, ranked by log p relative to the mode."""
-    z = scale * np.random.default_rng(seed).standard_normal((n, latent.dimension(sim)))
-    e = jax.device_get(latent.episodes(sim, jnp.asarray(z, latent.normal_numbers(sim))))
+    z = scale * np.random.default_rng(seed).standard_normal((n, transform.dimension(sim)))
+    e = jax.device_get(transform.episodes(sim, jnp.asarray(z, transform.normal_numbers(sim))))
     return collect(sim, likelihood(sim), e, top=200)
 
 
@@ -62,7 +62,7 @@ def test_on_a_knife_edge_the_replay_counts(key, monkeypatch):
     """Another program may round a failing episode to one that does not fail."""
     sim = linear(10)
     found = draws(sim, 4.0)
-    says_no = lambda sim, z: latent.played(sim, z)._replace(failure=np.zeros(len(z), bool))
+    says_no = lambda sim, z: transform.played(sim, z)._replace(failure=np.zeros(len(z), bool))
     monkeypatch.setattr(refinement, "played", says_no)
     result = refine(key, sim, found, budget=200)
     assert len(result.failures) == 1 and result.gain[0] > 0
@@ -130,9 +130,9 @@ def test_modes_are_the_origin_of_a_centred_simulator(key):
     )
     same = centred(sim)
     drawn = jax.device_get(jax.vmap(partial(jast.rollout, sim=sim))(jax.random.split(key, 20)))
-    back = latent.episodes(same, latent.normal_of(same, drawn))
+    back = transform.episodes(same, transform.normal_of(same, drawn))
     np.testing.assert_allclose(back.disturbances, drawn.disturbances, rtol=1e-3, atol=1e-5)
-    quiet = lambda v: jast.rollout(key, same, latent.policy_of(same, v), likelihood(sim)).reward
+    quiet = lambda v: jast.rollout(key, same, transform.policy_of(same, v), likelihood(sim)).reward
     assert float(quiet(jnp.zeros(4))) == pytest.approx(0, abs=1e-5)
     assert np.isfinite(jax.grad(quiet)(jnp.full(4, 0.5))).all()
 

@@ -12,7 +12,7 @@ import numpy as np
 from jast._src.core.counter_prng import numpy_generator
 from jast._src.core.simulator import Simulator
 from jast._src.estimate.population.population import episodes_a_second
-from jast._src.normal_space import transform as latent
+from jast._src.normal_space import transform
 from jast._src.normal_space.evaluate_points import judged
 from jast._src.runtime.host_errors import runs_on_host
 
@@ -90,7 +90,7 @@ def _episodes_a_second_on_host(key: jax.Array, sim: Simulator) -> float:
     """Episodes a second of a system that is not in JAX, by as many as take a fifth of one."""
     n, rng = 1, numpy_generator(key, 6)
     while True:
-        z = rng.standard_normal((n, latent.dimension(sim))).astype(latent.normal_numbers(sim))
+        z = rng.standard_normal((n, transform.dimension(sim))).astype(transform.normal_numbers(sim))
         begun = time.perf_counter()
         judged(sim, z)
         spent = time.perf_counter() - begun

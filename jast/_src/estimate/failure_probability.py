@@ -18,7 +18,7 @@ from jast._src.estimate.population.failure_sample import Sample
 from jast._src.estimate.population.population import by_populations
 from jast._src.estimate.proposal_search.by_proposal import Request, estimate_by_proposal
 from jast._src.estimate.redraw import is_proposal_of
-from jast._src.normal_space import transform as latent
+from jast._src.normal_space import transform
 from jast._src.runtime import work
 from jast._src.runtime._jax import briefly
 from jast._src.runtime.checkpoints import keep_answers, open_checkpoint
@@ -152,7 +152,7 @@ def failure_probability(
     if budget is not None:
         budget = whole_number(name, "budget", budget, few_calls.LEAST)
     level = checked_level(name, level)
-    latent.check(name, sim)
+    transform.check(name, sim)
     if near is not None and not isinstance(near, Estimate):
         raise ValueError(f"{name}: near must be an Estimate, received {type(near).__name__}")
     similar = None
@@ -164,7 +164,7 @@ def failure_probability(
         if not guided or seconds is not None:
             budget = budgets.measure_budget(name, key, sim, seconds, few_calls.LEAST)
     settings = call_settings(name, key, budget=budget, gradients=bool(gradients), level=level)
-    known = None if failures is None else latent.normal_of(sim, failures.episodes)
+    known = None if failures is None else transform.normal_of(sim, failures.episodes)
     ways, watched = work.placement(name, executor, devices), (progress, callback)
     about = dict(sim=sim, budget=budget, gradients=bool(gradients), known=known, near=similar)
     few = not budgets.uses_populations(sim, budget)

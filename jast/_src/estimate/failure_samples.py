@@ -21,7 +21,7 @@ from jast._src.estimate.proposals import as_proposal
 from jast._src.estimate.redraw import dimension_of, redraw
 from jast._src.estimate.tilts.tilts import Tilts, shape
 from jast._src.io.data_frames import dataset
-from jast._src.normal_space import transform as latent
+from jast._src.normal_space import transform
 from jast._src.runtime.checkpoints import answer_once, keep_answers, open_checkpoint
 from jast._src.runtime.memory import require_episodes
 from jast._src.util import display
@@ -133,7 +133,7 @@ def failure_samples(
     name = "failure_samples"
     check_random_key(name, key)
     samples, moves = whole_number(name, "samples", samples), whole_number(name, "moves", moves, 0)
-    latent.check(name, sim)
+    transform.check(name, sim)
     q = source.proposal if isinstance(source, Estimate) else source
     if q is None and isinstance(source, Estimate):
         raise ValueError(
@@ -153,13 +153,13 @@ def _draw_failures(name, key, sim, q, samples, moves):
     if isinstance(q, Sample):  # they are failures, which nobody has to look for
         z, log_w = q.points, q.log_weight
         failure, n = np.ones(len(z), bool), 0
-    elif isinstance(q, latent.Latent | Tilts):
+    elif isinstance(q, transform.Latent | Tilts):
         z, o, log_w = redraw(for_draws, sim, q, n)
         failure = o.failure
     else:
         q, key_data = as_proposal(name, sim, q), jax.random.key_data(for_draws)
         e, log_w = answer_once(lambda _: draw_episodes(for_draws, sim, q, n), key_data)
-        z, failure = latent.normal_of(sim, e), e.failure
+        z, failure = transform.normal_of(sim, e), e.failure
     log_w = np.where(failure & np.isfinite(log_w), log_w, -np.inf).astype(np.float64)
     if not np.isfinite(log_w).any():
         raise ValueError(
@@ -168,7 +168,7 @@ def _draw_failures(name, key, sim, q, samples, moves):
         )
     rows = resample(log_w, samples, float(jax.random.uniform(for_rows)))
     moved, sampler = equilibrate(key, sim, z[rows], moves)
-    episodes = answer_once(partial(latent.episodes, sim), moved.z)
+    episodes = answer_once(partial(transform.episodes, sim), moved.z)
     # numbers that decided nothing are no part of an episode; and rounding differs between compiled
     # programs, so an episode on the edge of failure may not fail again
     episodes = jax.tree.map(lambda a: a[episodes.failure], episodes)
@@ -187,7 +187,7 @@ def _check_source(name, sim, q):
         received, expected = q.frame.centre.shape[0], shape(sim).seen
         words = f"whose states show {expected} numbers, received one of a simulator that shows"
     else:
-        received, expected = dimension_of(q), latent.dimension(sim)
+        received, expected = dimension_of(q), transform.dimension(sim)
         words = f"with {expected} random numbers in an episode, received one with"
     if received not in (None, expected):
         raise ValueError(f"{name}: source must be of this simulator, {words} {received}")

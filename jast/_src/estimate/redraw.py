@@ -20,7 +20,7 @@ from jast._src.estimate.proposal_search.mixture_draws import (
 )
 from jast._src.estimate.tilts import tilts
 from jast._src.estimate.weighted_draws import Draws, source_key
-from jast._src.normal_space import transform as latent
+from jast._src.normal_space import transform
 from jast._src.normal_space.transform import Outcomes
 from jast._src.runtime._jax import jit
 
@@ -40,7 +40,7 @@ def redraw(key: Any, sim: Any, q: Any, n: int) -> tuple[np.ndarray, Outcomes, np
 def is_proposal_of(sim: Any, q: Any) -> bool:
     """Whether ``q`` is a proposal of `jast.estimate.failure_probability` for this simulator."""
     if (d := dimension_of(q)) is not None:
-        return d == latent.dimension(sim)
+        return d == transform.dimension(sim)
     if not isinstance(q, tilts.Tilts):
         return False
     about = tilts.shape(sim)
@@ -59,7 +59,7 @@ def dimension_of(q: Any) -> int | None:
     """Random numbers of an episode of the system that ``q`` is of, where it is a mixture of
     Gaussians or a `Sample`; else None.
     """
-    if isinstance(q, latent.Latent):
+    if isinstance(q, transform.Latent):
         return q.means.shape[1]
     return q.points.shape[1] if isinstance(q, Sample) else None
 
@@ -74,7 +74,7 @@ def redraw_chunk(key: Any, i: int, sim: Any, q: Any, n: int, lanes: int) -> np.n
         return q.points[i * lanes : i * lanes + n]
     if isinstance(q, tilts.Tilts):
         return redraw(numpy_generator(key, 2, i), sim, q, lanes)[0]
-    return latent.place(q, *numbers_of_chunk(key, i, n, q))
+    return transform.place(q, *numbers_of_chunk(key, i, n, q))
 
 
 def redraw_failures(
@@ -102,10 +102,10 @@ def _redraw_gaussians(key, sim, q, n):
 
 
 def _redraw_tilts(key, sim, q, n):
-    about, dtype = tilts.shape(sim), latent.normal_numbers(sim)
+    about, dtype = tilts.shape(sim), transform.normal_numbers(sim)
     chance = tilts.random_numbers(key, n, about, sim.horizon, dtype)
     o, ratio, trace = tilts.simulate_tilts(sim, q, *chance)
-    z = latent.normal_of(sim, _episodes_of_traces(sim, trace))
+    z = transform.normal_of(sim, _episodes_of_traces(sim, trace))
     return z, o, tilts.log_weight(q, ratio)[0]
 
 
@@ -122,7 +122,11 @@ def _choose_failures(key, sim, sample, n):
     return sample.points[rows], o, np.zeros(n)
 
 
-_REDRAW = {latent.Latent: _redraw_gaussians, tilts.Tilts: _redraw_tilts, Sample: _choose_failures}
+_REDRAW = {
+    transform.Latent: _redraw_gaussians,
+    tilts.Tilts: _redraw_tilts,
+    Sample: _choose_failures,
+}
 
 
 @jit

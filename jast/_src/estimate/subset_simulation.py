@@ -12,7 +12,7 @@ import numpy as np
 from jast._src.core.simulator import Simulator
 from jast._src.estimate.estimate import Estimate, estimate_from_mean
 from jast._src.estimate.host_populations import FINAL_MOVES, LEVEL_SHARE, Explored, explore
-from jast._src.normal_space import transform as latent
+from jast._src.normal_space import transform
 from jast._src.runtime import work
 from jast._src.runtime.backends import Task
 from jast._src.runtime.checkpoints import open_checkpoint
@@ -98,7 +98,7 @@ def subset_simulation(
     samples = whole_number(name, "samples", samples, MIN_SAMPLES)
     replicates = whole_number(name, "replicates", replicates, MIN_REPLICATES)
     level = checked_level(name, level)
-    latent.check(name, sim)
+    transform.check(name, sim)
     require_episodes(name, sim, samples)
     ways = work.placement(name, executor, devices)
     about = dict(sim=sim, samples=samples, replicates=replicates)

@@ -16,7 +16,7 @@ from jast._src.estimate.estimate import Estimate
 from jast._src.estimate.gaussians.mixture_fit import effective_sample_size
 from jast._src.explain.episodes import gather_episodes
 from jast._src.explain.estimate_draws import UNRELIABLE, failing_draws, free_undecided, normalised
-from jast._src.normal_space import transform as latent
+from jast._src.normal_space import transform
 from jast._src.normal_space.episode_point import number_names, number_steps, used_numbers
 from jast._src.search.refine.modes import pointing
 from jast._src.util import checks, display
@@ -150,7 +150,7 @@ def eigenfailures(
     checks.check_random_key(name, key)
     mode = checks.whole_number(name, "mode", mode, 0)
     directions = checks.whole_number(name, "directions", directions)
-    latent.check(name, sim)
+    transform.check(name, sim)
     z, log_w, length, good, spent = _points(name, sim, failures)
     ways = [] if isinstance(failures, Estimate) else getattr(failures, "modes", None) or []
     if mode >= max(len(ways), 1):
@@ -173,7 +173,7 @@ def eigenfailures(
     order = np.argsort(-nats, kind="stable")[:directions]
     vectors = vectors[order] * np.where(shifts[order] < 0, -1, 1)[:, None]
     moves = np.sqrt(variances[order])[:, None] * vectors
-    played = latent.played(sim, np.concatenate([mean[None], mean - moves, mean + moves]))
+    played = transform.played(sim, np.concatenate([mean[None], mean - moves, mean + moves]))
     k = len(order)
     middle, minus, plus = (
         jax.tree.map(lambda a, rows=rows: np.asarray(a)[rows], played)
@@ -235,14 +235,16 @@ def _points(
             f"{name}: failures must all fail, received {np.count_nonzero(~e.failure)} episodes of"
             f" {len(e.failure)} that do not"
         )
-    return latent.normal_of(sim, e), np.zeros(len(e.length)), e.length, True, len(e.length)
+    return transform.normal_of(sim, e), np.zeros(len(e.length)), e.length, True, len(e.length)
 
 
 def _modes_of(sim: Simulator, z: np.ndarray, length: np.ndarray, ways: Any) -> np.ndarray:
     """The mode of each of the points ``z`` [m, D], by direction: [m]."""
     known = np.arange(z.shape[1]) < used_numbers(sim, length)[:, None]
     heads = gather_episodes("eigenfailures", "failures", sim, ways)
-    return pointing(sim, np.where(known, z, 0), length, latent.normal_of(sim, heads), heads.length)
+    return pointing(
+        sim, np.where(known, z, 0), length, transform.normal_of(sim, heads), heads.length
+    )
 
 
 def _align_ends(sim: Simulator, z: np.ndarray, length: np.ndarray) -> np.ndarray:

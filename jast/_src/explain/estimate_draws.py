@@ -15,7 +15,7 @@ from jast._src.distributions.standardised import chances
 from jast._src.estimate.estimate import Estimate
 from jast._src.estimate.exceedance_and_times import draws_and_level
 from jast._src.estimate.redraw import dimension_of, redraw_failures
-from jast._src.normal_space import transform as latent
+from jast._src.normal_space import transform
 from jast._src.normal_space.episode_point import used_numbers
 
 __all__ = ["UNRELIABLE", "failing_draws", "free_undecided", "normalised"]
@@ -47,7 +47,7 @@ def failing_draws(
         )
     if not kept.failure.any():
         raise ValueError(f"{name}: estimate must have seen a failure, received one that saw none")
-    if (of := dimension_of(kept.source)) not in (None, d := latent.dimension(sim)):
+    if (of := dimension_of(kept.source)) not in (None, d := transform.dimension(sim)):
         raise ValueError(
             f"{name}: sim must be the simulator of the estimate, with {of} random numbers in an"
             f" episode, received one with {d}"
@@ -65,7 +65,7 @@ def free_undecided(
     about = outline(sim)
     whole = [np.issubdtype(leaf.dtype, np.integer) for leaf in jax.tree.leaves((about.x0, about.x))]
     if any(whole):
-        chance = latent.side_by_side(sim, partial(_chances, sim), z, lanes=LANES)
+        chance = transform.side_by_side(sim, partial(_chances, sim), z, lanes=LANES)
         u = np.asarray(ndtr(-np.abs(z)))
         u = u + chance * (rng.random(z.shape) - 0.5)
         moved = np.asarray(ndtri(jnp.clip(u, 1e-30, 1 - 1e-7))) * np.where(z > 0, -1, 1)
@@ -83,5 +83,5 @@ def _chances(sim: Simulator, z: jax.Array) -> jax.Array:
         steps = jax.vmap(lambda s, x: chances(sim.disturbance(s), x))(states, e.disturbances)
         return chances(sim.start(), e.x0) if outline(sim).random_start else (), steps
 
-    first, steps = jax.vmap(one)(latent.episodes(sim, z))
-    return latent.flat(sim, first, steps)
+    first, steps = jax.vmap(one)(transform.episodes(sim, z))
+    return transform.flat(sim, first, steps)

@@ -15,7 +15,7 @@ from jast._src.estimate.exceedance_and_times import draws_and_level
 from jast._src.estimate.gaussians.mixture_fit import effective_sample_size
 from jast._src.estimate.proposal_search.mixture_draws import resample
 from jast._src.explain.estimate_draws import UNRELIABLE, failing_draws, free_undecided, normalised
-from jast._src.normal_space import transform as latent
+from jast._src.normal_space import transform
 from jast._src.normal_space.episode_point import number_names, number_steps
 from jast._src.normal_space.evaluate_points import Judge
 from jast._src.util import checks, display
@@ -151,7 +151,7 @@ def indices(
     checks.check_random_key(name, key)
     kept, level = draws_and_level(name, estimate, level)
     draws = checks.whole_number(name, "draws", draws, 0)
-    latent.check(name, sim)
+    transform.check(name, sim)
     rng = numpy_generator(key)
     z, log_w, length, spent = failing_draws(name, sim, estimate, KEPT)
     z = free_undecided(sim, z, length, rng)

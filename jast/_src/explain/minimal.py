@@ -9,7 +9,7 @@ import numpy as np
 
 from jast._src.core.episode import Episode, replay
 from jast._src.core.simulator import Simulator
-from jast._src.normal_space import transform as latent
+from jast._src.normal_space import transform
 from jast._src.normal_space.episode_point import (
     EpisodePoint,
     failing_point,
@@ -114,7 +114,7 @@ def minimal(
         g = farther
     kept = _find_needed(g, orders, budget)
     v = _shrink(g, np.where(kept, g.v, 0.0), budget)
-    e = latent.played(g.sim, v[None])
+    e = transform.played(g.sim, v[None])
     e = jax.device_get(replay(sim, jax.tree.map(lambda a: a[0], e._replace(states=None))))
     kept &= number_steps(sim) <= int(e.length)
     x0, needed = like_disturbances(sim, kept)

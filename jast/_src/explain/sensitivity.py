@@ -17,7 +17,7 @@ from jast._src.estimate.gaussians.mixture_fit import effective_sample_size
 from jast._src.estimate.population.failure_sample import Sample
 from jast._src.estimate.redraw import is_proposal_of, redraw
 from jast._src.explain.estimate_draws import UNRELIABLE, normalised
-from jast._src.normal_space import transform as latent
+from jast._src.normal_space import transform
 from jast._src.util import checks, display
 from jast._src.util.intervals import checked_level
 
@@ -113,7 +113,7 @@ def sensitivity(
         checks.whole_number(name, "samples", samples, LANES),
         checked_level(name, level),
     )
-    latent.check(name, sim)
+    transform.check(name, sim)
     q = getattr(estimate, "proposal", None)
     if not is_proposal_of(sim, q):
         raise ValueError(
@@ -197,7 +197,7 @@ def _scores(sim: Simulator, z: jax.Array) -> jax.Array:
         return replay(replace(sim, **treedef.unflatten(own)), e).log_prob
 
     def one(z):
-        e = jax.lax.stop_gradient(latent.episodes(sim, z[None]))
+        e = jax.lax.stop_gradient(transform.episodes(sim, z[None]))
         e = jax.tree.map(lambda a: a[0], e._replace(states=None))
         slopes = jax.grad(log_p)([a for a, m in zip(leaves, moving, strict=True) if m], e)
         return jnp.concatenate([a.reshape(-1) for a in slopes])

@@ -14,7 +14,7 @@ from jast._src.estimate.proposal_search.mixture_draws import resample
 from jast._src.estimate.redraw import is_proposal_of, redraw_failures
 from jast._src.estimate.weighted_draws import Draws
 from jast._src.explain.episodes import distinct_rows, gather_episodes, named_kinds
-from jast._src.normal_space import transform as latent
+from jast._src.normal_space import transform
 from jast._src.normal_space.episode_point import used_numbers
 from jast._src.normal_space.evaluate_points import Judge
 from jast._src.normal_space.pcn import proposed
@@ -66,7 +66,7 @@ def find_seeds(function: str, sim: Simulator, given: Any, labels: Any, most: int
         labels: names of the kinds of the episodes, one each; None: of a report or of
             `jast.search.Modes` the number of the mode, else all are of one kind.
     """
-    latent.check(function, sim)
+    transform.check(function, sim)
     estimate = getattr(given, "probability", None) or given
     kept = estimate.draws if isinstance(estimate, Estimate) else None
     modes = given if isinstance(given, Modes) else getattr(given, "modes", None)
@@ -99,7 +99,7 @@ def find_seeds(function: str, sim: Simulator, given: Any, labels: Any, most: int
     e, label = jax.tree.map(lambda a: a[rows], e), label[rows]
     if not len(e.length):
         raise ValueError(f"{function}: failures must hold at least one failure, received none")
-    z = latent.normal_of(sim, e)
+    z = transform.normal_of(sim, e)
     o = Judge(sim)(z)
     if not e.failure.all() or not o.failure.any():
         raise ValueError(
@@ -132,12 +132,12 @@ def _label_by_mode(function: str, sim: Simulator, seeds: Seeds, modes: Any) -> S
     if modes is None or len(modes) < 2:
         return seeds
     best = gather_episodes(function, "modes", sim, modes[:MODES])
-    heads = latent.normal_of(sim, best)
+    heads = transform.normal_of(sim, best)
     judge = Judge(sim)
     o = judge(heads)
     z = np.concatenate([seeds.z, heads[o.failure]]).astype(heads.dtype)
     used = np.concatenate([seeds.used, o.used[o.failure]])
-    label = owners(sim, latent.played(sim, z), best)
+    label = owners(sim, transform.played(sim, z), best)
     label[len(seeds.z) :] = np.flatnonzero(o.failure)
     # a mode's likeliest failure counts only where nothing else is known of the mode
     log_w = np.concatenate([seeds.log_weight, np.full(int(o.failure.sum()), UNKNOWN_WEIGHT)])
@@ -182,8 +182,8 @@ def draw_variants(key: jax.Array, sim: Simulator, seeds: Seeds, n: int) -> Varia
         near[kept] = to[kept]
         z = np.where(o.failure[:, None], to, z)
     missed = np.flatnonzero(misses)
-    bad = latent.played(sim, z)
-    calm = latent.played(sim, near[missed]) if len(missed) else bad
+    bad = transform.played(sim, z)
+    calm = transform.played(sim, near[missed]) if len(missed) else bad
     fails = np.flatnonzero(bad.failure)
     calm_rows = np.flatnonzero(~calm.failure) if len(missed) else np.zeros(0, int)
     label, group = seeds.label[seed[fails]], seed[fails]

@@ -9,7 +9,7 @@ from jast._src.core.episode import Episode
 from jast._src.core.signature import outline
 from jast._src.core.simulator import Simulator
 from jast._src.distributions.flat_rows import unflat
-from jast._src.normal_space import transform as latent
+from jast._src.normal_space import transform
 from jast._src.normal_space.evaluate_points import Judge
 from jast._src.normal_space.mode_coordinates import centred
 from jast._src.util.leaf_names import entry_places, leaf_name
@@ -37,7 +37,7 @@ class EpisodePoint(NamedTuple):
     judge: Judge
     v: np.ndarray
     """[D] float64; 0 where a number decided nothing"""
-    outcome: latent.Outcomes
+    outcome: transform.Outcomes
     """Of the point, one row"""
 
 
@@ -53,10 +53,10 @@ def failing_point(name: str, sim: Simulator, episode: Episode) -> EpisodePoint:
             f"{name}: episode must be one episode, received a batch of shape"
             f" {np.shape(episode.failure)}: choose one of them"
         )
-    latent.check(name, sim)
+    transform.check(name, sim)
     of_modes = centred(sim)
     one = jax.tree.map(lambda a: np.asarray(a)[None], episode._replace(states=None))
-    recorded = latent.normal_of(of_modes, one)[0].astype(np.float64)
+    recorded = transform.normal_of(of_modes, one)[0].astype(np.float64)
     judge = Judge(of_modes)
     # the way to normal numbers and back rounds, and a refined failure lies on the edge of failing
     for lift in LIFTS if bool(episode.failure) else LIFTS[:1]:

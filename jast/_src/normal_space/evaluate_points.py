@@ -10,7 +10,7 @@ import numpy as np
 from jax import lax
 
 from jast._src.core.simulator import Simulator
-from jast._src.normal_space import transform as latent
+from jast._src.normal_space import transform
 from jast._src.runtime._jax import jit
 from jast._src.runtime.checkpoints import answer_once
 from jast._src.runtime.host_errors import runs_on_host
@@ -26,26 +26,26 @@ class Judge:
     """Judges points of ``sim`` and counts the episodes, ``spent``."""
 
     def __init__(self, sim: Simulator):
-        self.sim, self.dtype, self.spent = sim, latent.normal_numbers(sim), 0
+        self.sim, self.dtype, self.spent = sim, transform.normal_numbers(sim), 0
 
-    def __call__(self, points: np.ndarray) -> latent.Outcomes:
+    def __call__(self, points: np.ndarray) -> transform.Outcomes:
         """`Outcomes` [m] of ``points`` [m, D]."""
         self.spent += len(points)
         return judged(self.sim, np.asarray(points, self.dtype))
 
 
-def judged(sim: Simulator, z: np.ndarray) -> latent.Outcomes:
+def judged(sim: Simulator, z: np.ndarray) -> transform.Outcomes:
     """`Outcomes` of the points ``z`` [n, D], on the host. One program serves every ``n``; a black
     box runs once a point, in batches of ``n``.
     """
     if runs_on_host(sim):
-        return answer_once(lambda z: latent.outcomes(sim, jnp.asarray(z)), z)
+        return answer_once(lambda z: transform.outcomes(sim, jnp.asarray(z)), z)
     n, d = z.shape
     lanes, out = lanes_of(d), []
     for i in range(0, n, lanes):
         part = z[i : i + lanes]
         out.append(answer_once(partial(_padded, sim, lanes), part, rows=len(part)))
-    return out[0] if len(out) == 1 else latent.Outcomes(*map(np.concatenate, zip(*out)))
+    return out[0] if len(out) == 1 else transform.Outcomes(*map(np.concatenate, zip(*out)))
 
 
 def _padded(sim, lanes, z):
@@ -63,7 +63,7 @@ def lanes_of(d: int) -> int:
 @jit
 def _in_blocks(sim, z, n):
     """`Outcomes` of the first ``n`` of ``z``; of the others what is left of their blocks."""
-    run = jax.vmap(partial(latent.outcome, sim))
+    run = jax.vmap(partial(transform.outcome, sim))
     like = jax.eval_shape(run, z)
 
     def block(i, out):

@@ -13,7 +13,7 @@ import numpy as np
 from jast._src.core.episode import Episode, replay
 from jast._src.core.simulator import Simulator
 from jast._src.distributions.standardised import spread
-from jast._src.normal_space import transform as latent
+from jast._src.normal_space import transform
 from jast._src.plot import style
 from jast._src.util.leaf_names import named_fields
 
@@ -112,7 +112,7 @@ def disturbances(
     if sim is None:
         first, steps = (), episode.disturbances
     else:
-        latent.check("plot.disturbances", sim)
+        transform.check("plot.disturbances", sim)
         first, steps = spreads(sim, episode)
     first = [
         (f if f.name.startswith("x0") else f._replace(name=f"x0 {f.name}"), 0)

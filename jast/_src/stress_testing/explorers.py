@@ -17,7 +17,7 @@ from jast._src.core.signature import outline
 from jast._src.core.simulator import Simulator
 from jast._src.estimate.gaussians.design_points import design_points
 from jast._src.estimate.host_populations import cool, explore
-from jast._src.normal_space import transform as latent
+from jast._src.normal_space import transform
 from jast._src.normal_space.mode_coordinates import centred
 from jast._src.runtime.host_errors import runs_on_host
 from jast._src.search.cem import cem
@@ -183,7 +183,7 @@ def failures_at(sim: Simulator, points: np.ndarray) -> ExplorerResult:
     points = points[:MAX_FAILURES]
     if not len(points):
         return ExplorerResult(empty(sim).episodes, 0, 0, 0)
-    e = latent.played(sim, points)
+    e = transform.played(sim, points)
     e = jax.tree.map(lambda a: a[e.failure], e)
     return ExplorerResult(e, len(points), len(e.length), 0)
 

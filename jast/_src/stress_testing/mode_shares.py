@@ -11,7 +11,7 @@ from jast._src.core.simulator import Simulator
 from jast._src.estimate.population.failure_sample import Sample
 from jast._src.estimate.proposal_search.mixture_draws import resample
 from jast._src.estimate.redraw import redraw
-from jast._src.normal_space import transform as latent
+from jast._src.normal_space import transform
 from jast._src.normal_space.mode_coordinates import centred
 from jast._src.search.refine.connectivity import Paths, assigned, nearest
 from jast._src.search.refine.modes import UNKNOWN, Modes
@@ -68,11 +68,11 @@ def mode_shares(
     of_modes = centred(sim)
 
     def place(e):
-        return latent.normal_of(of_modes, e).astype(np.float64), np.asarray(e.length)
+        return transform.normal_of(of_modes, e).astype(np.float64), np.asarray(e.length)
 
     bests = [m.failure._replace(states=None) for m in modes]
     targets = place(jax.tree.map(lambda *a: np.stack([np.asarray(b) for b in a]), *bests))
-    points, ends = place(latent.played(sim, z))
+    points, ends = place(transform.played(sim, z))
     step = len(z) // MAX_PATH_FAILURES
     some = np.arange(step // 2, len(z), step)
     paths = Paths(of_modes, int(PATHS_SHARE * budget))

@@ -27,7 +27,7 @@ from jast._src.estimate.population.failure_sample import Sample
 from jast._src.estimate.population.population import by_populations
 from jast._src.estimate.proposal_search.mixture_draws import resample
 from jast._src.estimate.redraw import redraw
-from jast._src.normal_space import transform as latent
+from jast._src.normal_space import transform
 from jast._src.runtime import work
 from jast._src.runtime._jax import briefly
 from jast._src.runtime.checkpoints import keep_answers, open_checkpoint
@@ -231,7 +231,7 @@ class _StressTest:
         self.residual = self.late = np.nan
         self.has_points = has_quantiles(sim)
         large = (1 - sum(LARGE_SHARES)) * budget >= MIN_ESTIMATE_BUDGET
-        few_numbers = self.has_points and latent.dimension(sim) <= MAX_SURROGATE_NUMBERS
+        few_numbers = self.has_points and transform.dimension(sim) <= MAX_SURROGATE_NUMBERS
         self.estimable = self.has_points and (large or few_numbers)
         self.cheap = self.has_points and budgets.uses_populations(sim, budget)
         shares = COUNTING_SHARES
@@ -448,7 +448,7 @@ class _StressTest:
         p = self.probability
         if not (self.modes and p.reliable):
             return
-        if p.draws is not None and isinstance(p.draws.source, latent.Latent):
+        if p.draws is not None and isinstance(p.draws.source, transform.Latent):
             q = p.draws.source  # independent draws tell more than few populations
         self.watch.doing("shares of modes")
         budget = min(self.budget, DEFAULT_BUDGET)

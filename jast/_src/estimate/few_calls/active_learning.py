@@ -22,7 +22,7 @@ from jast._src.estimate.few_calls.surrogate import (
     probability_below_zero,
 )
 from jast._src.estimate.few_calls.surrogate_pool import DOUBT, Pool, expected, pool
-from jast._src.normal_space import transform as latent
+from jast._src.normal_space import transform
 from jast._src.runtime.checkpoints import answer_once
 from jast._src.runtime.progress_bar import Watch
 
@@ -56,7 +56,7 @@ class Learner:
     def __init__(self, key: Any, sim: Simulator, budget: int, watch: Watch):
         self.sim, self.budget, self.watch = sim, budget, watch
         self.rng = numpy_generator(key)
-        self.dtype, self.dimension = latent.normal_numbers(sim), latent.dimension(sim)
+        self.dtype, self.dimension = transform.normal_numbers(sim), transform.dimension(sim)
         self.z, self.distance = np.zeros((0, self.dimension)), np.zeros(0)
         self.failing, self.invalid = np.zeros(0, bool), np.zeros(0, bool)
         self.steps, self.spent = 0, 0
@@ -82,7 +82,7 @@ class Learner:
         return np.concatenate(failure), np.concatenate(invalid)
 
     def _simulate(self, rows):
-        return latent.outcomes(self.sim, jnp.asarray(rows))
+        return transform.outcomes(self.sim, jnp.asarray(rows))
 
     def record(self, z, distance, failing, invalid):
         """Keep what was seen at ``z``."""
@@ -144,7 +144,7 @@ def _unseen(learner, n):
     if not n:
         return np.zeros((0, learner.dimension))
     radius = np.quantile(np.linalg.norm(learner.z[learner.failing], axis=1), UNSEEN_NEAREST)
-    z = latent.unit(learner.rng.standard_normal((UNSEEN_TRIED, learner.dimension)))
+    z = transform.unit(learner.rng.standard_normal((UNSEEN_TRIED, learner.dimension)))
     z *= radius * learner.rng.uniform(1.0, UNSEEN_FARTHER, (UNSEEN_TRIED, 1))
     gaps, chosen = ((z[:, None] - learner.z[None]) ** 2).sum(axis=2).min(axis=1), []
     for _ in range(n):

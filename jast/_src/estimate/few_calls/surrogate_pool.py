@@ -15,7 +15,7 @@ from jast._src.estimate.few_calls.surrogate import Surrogate, predict, probabili
 from jast._src.estimate.gaussians.design_points import distinct
 from jast._src.estimate.gaussians.mixture_fit import as_latent, fit_mixture, unit_gaussians
 from jast._src.estimate.proposal_search import mixture_draws
-from jast._src.normal_space import transform as latent
+from jast._src.normal_space import transform
 from jast._src.normal_space.pcn import proposed
 
 __all__ = ["DOUBT", "Pool", "expected", "pool"]
@@ -55,7 +55,7 @@ class Pool(NamedTuple):
 
     z: np.ndarray
     weights: np.ndarray
-    mixture: latent.Latent
+    mixture: transform.Latent
 
 
 def pool(
@@ -129,7 +129,7 @@ def _scaled(share, parts):
 def _draw(rng, q, n):
     """Points [n, D] of the `Latent` ``q``, and their weights p / q."""
     d = q.means.shape[1]
-    z = latent.place(q, *mixture_draws.random_numbers(rng, n, d, np.float64))
+    z = transform.place(q, *mixture_draws.random_numbers(rng, n, d, np.float64))
     return z, np.exp(-mixture_draws.log_ratio(q, z, np.full(n, d)))
 
 

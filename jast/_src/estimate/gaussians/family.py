@@ -28,7 +28,7 @@ from jast._src.estimate.gaussians.mixture_fit import (
 from jast._src.estimate.proposal_search.mixture_draws import draw_mixture, log_ratio, random_numbers
 from jast._src.estimate.proposal_search.search_state import Batch, SearchContext, SearchState
 from jast._src.estimate.proposal_search.settings import SETTINGS, SearchSettings
-from jast._src.normal_space import transform as latent
+from jast._src.normal_space import transform
 
 __all__ = ["GaussianFamily", "Points", "defensive_parts"]
 
@@ -69,12 +69,12 @@ class GaussianFamily(NamedTuple):
     @property
     def dimension(self) -> int:
         """D."""
-        return latent.dimension(self.sim)
+        return transform.dimension(self.sim)
 
     @property
     def dtype(self) -> Any:
         """Of the normal numbers."""
-        return latent.normal_numbers(self.sim)
+        return transform.normal_numbers(self.sim)
 
     @property
     def chains(self) -> int:
@@ -88,11 +88,11 @@ class GaussianFamily(NamedTuple):
         held = (most_components(self.dimension) - 1) // 2
         return max(min(self.chains, held), self.settings.dense_directions)
 
-    def model(self) -> latent.Latent:
+    def model(self) -> transform.Latent:
         """The model itself as a proposal."""
         return as_latent([(1.0, unit_gaussians(np.zeros((1, self.dimension))))], self.dtype)
 
-    def draw(self, q: latent.Latent) -> Batch:
+    def draw(self, q: transform.Latent) -> Batch:
         numbers = random_numbers(self.context.rng, self.batch, self.dimension, self.dtype)
         z, o, log_w, _ = draw_mixture(self.sim, q, *numbers)
         points = Points(z[o.failure], np.asarray(o.used)[o.failure])
@@ -104,7 +104,7 @@ class GaussianFamily(NamedTuple):
             invalid=int(np.sum(o.invalid)),
         )
 
-    def log_ratio(self, q: latent.Latent, points: Points) -> np.ndarray:
+    def log_ratio(self, q: transform.Latent, points: Points) -> np.ndarray:
         return log_ratio(q, points.z, points.used)
 
     def as_points(self, state: SearchState, z: Any, used: Any) -> tuple[SearchState, Points]:
@@ -114,13 +114,15 @@ class GaussianFamily(NamedTuple):
     def select(self, points: Points, rows: np.ndarray) -> Points:
         return Points(points.z[rows], points.used[rows])
 
-    def on_device(self, q: latent.Latent) -> latent.Latent:
+    def on_device(self, q: transform.Latent) -> transform.Latent:
         return q
 
-    def with_model(self, q: latent.Latent, share: float) -> latent.Latent:
+    def with_model(self, q: transform.Latent, share: float) -> transform.Latent:
         return mix(q, self.model(), share)
 
-    def exclusion(self, q: latent.Latent, threshold: float) -> tuple[latent.Latent, float] | None:
+    def exclusion(
+        self, q: transform.Latent, threshold: float
+    ) -> tuple[transform.Latent, float] | None:
         """What keeps populations out of where log q - log p is above the ``threshold``; None, which
         costs no densities, for one that is infinite.
         """
@@ -156,13 +158,13 @@ class GaussianFamily(NamedTuple):
         decided = np.arange(self.dimension)[None] < points.used[:, None]
         return np.where(decided, z, self.context.rng.standard_normal(z.shape))
 
-    def centres(self, q: latent.Latent) -> np.ndarray:
+    def centres(self, q: transform.Latent) -> np.ndarray:
         """The distinct means of a proposal [m, D]."""
         least = math.log(self.settings.direction_share_least / self.directions)
         heavy = np.asarray(q.log_weights) > least
         return distinct(np.asarray(q.means, np.float64)[heavy], self.directions)
 
-    def refit(self, state: SearchState) -> dict[str, latent.Latent]:
+    def refit(self, state: SearchState) -> dict[str, transform.Latent]:
         """Mixtures fitted to the failures of all batches, by name."""
         log_w, centres = state.log_weight, self.centres(state.q)
         batches = zip(*(b.points for b in state.batches), strict=True)

@@ -21,7 +21,7 @@ from jast._src.estimate.population.descents import SETTINGS, population_size
 from jast._src.estimate.population.importance import importance_estimate
 from jast._src.estimate.population.particle_moves import allocate_particles, draw_particles
 from jast._src.estimate.population.search import PopulationSearch
-from jast._src.normal_space import transform as latent
+from jast._src.normal_space import transform
 from jast._src.runtime import work
 from jast._src.runtime.checkpoints import open_checkpoint
 from jast._src.runtime.memory import require
@@ -123,7 +123,7 @@ def population(
     budget = whole_number(name, "budget", budget, MIN_BUDGET)
     particles = whole_number(name, "particles", particles, MIN_PARTICLES)
     level = checked_level(name, level)
-    latent.check(name, sim)
+    transform.check(name, sim)
     ways = work.placement(name, executor, devices)
     with open_checkpoint(
         name, checkpoint, key, sim=sim, budget=budget, particles=particles
@@ -175,7 +175,7 @@ def by_populations(
     """The `Estimate` of `population`, for the function of this ``name``."""
     capacity = population_size(sim, particles)
     n = population_size(sim, min(capacity, max(budget // POINTS_DIVISOR, MIN_PARTICLES)))
-    numbers = capacity * latent.dimension(sim) * np.dtype(latent.normal_numbers(sim)).itemsize
+    numbers = capacity * transform.dimension(sim) * np.dtype(transform.normal_numbers(sim)).itemsize
     require(name, 4 * numbers, f"populations of {capacity} points", "use fewer particles")
     with Watch(name, budget, "episode", *watched) as watch:
         search = PopulationSearch(key, sim, budget, n=n, capacity=capacity, watch=watch, ways=ways)

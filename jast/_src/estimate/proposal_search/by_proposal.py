@@ -42,7 +42,7 @@ from jast._src.estimate.tilts.exploration import (
 from jast._src.estimate.tilts.family import TiltFamily
 from jast._src.estimate.tilts.tilts import Tilts, shape
 from jast._src.estimate.weighted_draws import with_source
-from jast._src.normal_space import transform as latent
+from jast._src.normal_space import transform
 from jast._src.runtime._jax import was_interrupted
 from jast._src.runtime.host_errors import runs_on_host
 from jast._src.runtime.progress_bar import Watch
@@ -65,7 +65,7 @@ class Request(NamedTuple):
     failures: Failures | None = None
     failure_points: np.ndarray | None = None
     """[m, D] their normal numbers"""
-    near: latent.Latent | Tilts | None = None
+    near: transform.Latent | Tilts | None = None
     """The proposal of a similar system"""
     level: float = 0.95
     watched: tuple[bool, Callback | None] = (False, None)
@@ -153,7 +153,7 @@ def _search_gaussians(request, context, state):
     f = GaussianFamily(request.sim, request.budget, context, settings)
     end = state.spent + settings.refits_end * (request.budget - state.spent)
     state = draw_model(f, state)
-    if isinstance(request.near, latent.Latent):
+    if isinstance(request.near, transform.Latent):
         start = state._replace(q=request.near, anchors=f.centres(request.near))
         near = _adapt_near(f, start)
         if is_efficient(near, settings.near_fitted_efficiency):

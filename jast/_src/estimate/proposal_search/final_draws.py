@@ -18,7 +18,7 @@ from jast._src.estimate.proposal_search.mixture_draws import component_numbers, 
 from jast._src.estimate.tilts import tilts
 from jast._src.estimate.tilts.tilts import Tilts
 from jast._src.estimate.weighted_draws import with_source
-from jast._src.normal_space import transform as latent
+from jast._src.normal_space import transform
 from jast._src.runtime.progress_bar import Watch
 from jast._src.runtime.work import Placement
 
@@ -31,7 +31,7 @@ TILTS = 2  # address of the random numbers of tilts
 def draw_estimate(
     key: jax.Array,
     sim: Simulator,
-    q: latent.Latent | Tilts,
+    q: transform.Latent | Tilts,
     lanes: int,
     watch: Watch,
     ways: Placement,
@@ -50,7 +50,7 @@ def draw_estimate(
 
     def plain(i):
         numbers = component_numbers(key, i, lanes, q.log_weights.dtype)
-        return model[latent.component(q, numbers)]
+        return model[transform.component(q, numbers)]
 
     shared = key, sim, q, _members(modes, len(model)), lanes, watch.total
     total, notes, lost = chunks(_traces, shared, lanes, watch, ways, plain)
@@ -76,7 +76,7 @@ def _modes(q):
     if isinstance(q, Tilts):
         model = np.arange(len(q.log_weights)) == 0
         return [[0], list(range(1, int(np.isfinite(q.log_weights).sum())))], model, model
-    return _by_direction(q), latent.is_model(q), ~np.asarray(q.means).any(axis=1)
+    return _by_direction(q), transform.is_model(q), ~np.asarray(q.means).any(axis=1)
 
 
 def _members(modes, components):
@@ -103,7 +103,7 @@ def _by_direction(q):
     """Groups of the components whose means point the same way: failure modes, as lists of
     numbers.
     """
-    ways = latent.unit(np.asarray(q.means, np.float64))
+    ways = transform.unit(np.asarray(q.means, np.float64))
     left, groups = list(np.flatnonzero(np.isfinite(np.asarray(q.log_weights)))), []
     while left:
         group, grown = {left[0]}, True
@@ -140,7 +140,7 @@ def _draw_gaussians(key, sim, q, i, n, lanes):
 
 def _draw_tilts(key, sim, q, i, n, lanes):
     """The same of tilts."""
-    about, dtype = tilts.shape(sim), latent.normal_numbers(sim)
+    about, dtype = tilts.shape(sim), transform.normal_numbers(sim)
     u, first, noise = tilts.random_numbers(
         numpy_generator(key, TILTS, i), lanes, about, sim.horizon, dtype
     )

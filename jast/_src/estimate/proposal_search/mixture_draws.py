@@ -10,7 +10,7 @@ import numpy as np
 from jast._src.core.counter_prng import counter_key, numpy_generator
 from jast._src.core.simulator import Simulator
 from jast._src.estimate.gaussians.mixture_fit import log_sum, with_log_shares
-from jast._src.normal_space import transform as latent
+from jast._src.normal_space import transform
 from jast._src.normal_space.evaluate_points import judged, lanes_of
 
 __all__ = [
@@ -29,7 +29,7 @@ COMPONENTS = 2  # address of the numbers of an estimate that choose components
 NORMALS = 3  # address of its normal numbers
 
 
-def log_ratio(q: latent.Latent, z: np.ndarray, used: np.ndarray) -> np.ndarray:
+def log_ratio(q: transform.Latent, z: np.ndarray, used: np.ndarray) -> np.ndarray:
     """log q - log p [n] of points ``z`` [n, D] over their first ``used`` numbers."""
     return log_sum(log_joint(q, z, used)) if len(z) else np.zeros(0)
 
@@ -37,16 +37,16 @@ def log_ratio(q: latent.Latent, z: np.ndarray, used: np.ndarray) -> np.ndarray:
 def log_joint(q, z, used):
     """log of weight_k q_k over p [n, K]."""
     z = np.asarray(z, q.means.dtype)
-    return latent.log_ratios(q, z, np.asarray(used)) + np.asarray(q.log_weights, np.float64)
+    return transform.log_ratios(q, z, np.asarray(used)) + np.asarray(q.log_weights, np.float64)
 
 
 def draw_mixture(
-    sim: Simulator, q: latent.Latent, u: np.ndarray, e: np.ndarray
-) -> tuple[np.ndarray, latent.Outcomes, np.ndarray, np.ndarray]:
+    sim: Simulator, q: transform.Latent, u: np.ndarray, e: np.ndarray
+) -> tuple[np.ndarray, transform.Outcomes, np.ndarray, np.ndarray]:
     """Episodes of ``q`` by uniform numbers ``u`` [n] and normal ones ``e`` [n, D]: z, `Outcomes`,
     log p - log q, log shares of the components [n, K]. On the host.
     """
-    z = latent.place(q, u, e)
+    z = transform.place(q, u, e)
     o = judged(sim, z)
     log_q, shares = with_log_shares(log_joint(q, z, o.used))
     return z, o, -log_q, shares
@@ -74,7 +74,7 @@ def component_numbers(key, i, n, dtype):
 
 def plain_chunk(key, i, n, sim):
     """The first ``n`` points [n, D] of chunk ``i`` of the model itself."""
-    d, dtype, m = latent.dimension(sim), latent.normal_numbers(sim), rows_of(sim)
+    d, dtype, m = transform.dimension(sim), transform.normal_numbers(sim), rows_of(sim)
     parts = (_normals(counter_key(key, NORMALS, i, j), m, d, dtype) for j in range(-(-n // m)))
     return np.concatenate([np.asarray(z) for z in parts])[:n]
 
@@ -86,7 +86,7 @@ def _normals(key, n, d, dtype):
 
 def rows_of(sim):
     """Points that are drawn, and judged, by one call of a program."""
-    return lanes_of(latent.dimension(sim))
+    return lanes_of(transform.dimension(sim))
 
 
 def resample(log_w: np.ndarray, size: int, shift: float) -> np.ndarray:
