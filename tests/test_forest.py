@@ -386,6 +386,11 @@ def test_bad_input_is_named(name, value):
             mcts(jax.random.key(0), FERRY, **dict(trees=2, simulations=20) | {name: value})
 
 
+def test_a_setting_that_mcts_has_not_is_named(key):
+    with pytest.raises(TypeError, match=r"mcts\(\) got an unexpected keyword argument 'prunes'"):
+        mcts(key, jast.simulators.walk1d(), prunes=3)
+
+
 def test_a_simulator_that_breaks_its_contract_is_refused():
     with pytest.raises(ValueError, match="^step: "):
         forest(jax.random.key(0), walk(step=lambda s, x: s[None]), **SIZE)

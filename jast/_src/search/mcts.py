@@ -52,9 +52,9 @@ def mcts(key: chex.PRNGKey, sim: Simulator, **settings: Any) -> SearchResult:
         >>> bool(result.best.failure)
         True
     """
-    given = SIGNATURE.bind(key, sim, **settings)
-    given.apply_defaults()
-    return grow_trees("mcts", MODES, prunes=1, **given.arguments)
+    for name in settings.keys() - DEFAULTS.keys():
+        raise TypeError(f"mcts() got an unexpected keyword argument {name!r}")
+    return grow_trees("mcts", MODES, key=key, sim=sim, prunes=1, **DEFAULTS | settings)
 
 
 def _signature() -> inspect.Signature:
@@ -68,5 +68,9 @@ def _signature() -> inspect.Signature:
     return whole.replace(parameters=list(own.values()))
 
 
-SIGNATURE = _signature()
-mcts.__signature__ = SIGNATURE
+mcts.__signature__ = _signature()
+DEFAULTS = {
+    name: parameter.default
+    for name, parameter in mcts.__signature__.parameters.items()
+    if parameter.default is not parameter.empty
+}
