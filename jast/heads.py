@@ -6,8 +6,9 @@ from jast._src.heads.heads import Heads, Moments
 from jast._src.heads.heads_policy import as_policy
 from jast._src.heads.networks import Head, make_head
 from jast._src.heads.settings import MODES, HeadSettings, settings
-from jast._src.heads.storage import load, save
+from jast._src.heads.storage import load
 from jast._src.heads.train_head import Lesson
+from jast._src.io.save_load import save
 from jast._src.util.doors import dir_function
 
 __all__ = [

@@ -2,6 +2,7 @@
 a classifier gets wrong, found with few calls of it.
 """
 
+from jast._src.io.save_load import load, save
 from jast._src.util.doors import dir_function
 from jast._src.weakness.data import Data, digits, from_idx, idx
 from jast._src.weakness.encoded import Encoded, encoded
@@ -10,7 +11,6 @@ from jast._src.weakness.measures import Judgement, Roc, auc, judge, roc
 from jast._src.weakness.result import History, Result, State
 from jast._src.weakness.selector_contract import Seen, Selector, Step
 from jast._src.weakness.selectors import default, random, thesis
-from jast._src.weakness.storage import load, save
 from jast._src.weakness.validation import validate
 
 __all__ = [

@@ -2,6 +2,7 @@
 
 import functools
 import json
+from pathlib import Path
 from typing import NamedTuple
 
 import jax
@@ -404,16 +405,100 @@ def test_a_failure_policy_needs_its_simulator(tmp_path):
 
 def test_files_of_the_former_functions_are_the_same(tmp_path, equal):
     archive, path = made("failures"), tmp_path / "f"
-    jast.failures.save(path, archive, {"method": "forest", "n": np.int64(3)})
+    settings = {"method": "forest", "n": np.int64(3), "widening": (0.5, [0.6])}
+    jast.failures.save(path, archive, settings)
     equal(jast.load(path), archive)
     equal(jast.load(path, WALK), archive)
-    back, settings = jast.failures.load(path)
+    back, kept = jast.failures.load(path)
     equal(back, archive)
-    assert settings == {"method": "forest", "n": 3}
+    same(settings, kept)
     jast.save(path, archive)
     assert jast.failures.load(path)[1] == {}
     state = made("validation").state
     jast.weakness.save(path, state)
-    same(state, jast.load(path))
+    same(state, jast.weakness.load(path))
     jast.save(path, heads())
     equal(jast.heads.load(path), jast.load(path))
+
+
+# files of 0.2.0, in which four kinds of result had formats of their own
+
+
+def former(name):
+    """The path of a file that 0.2.0 wrote, and its arrays."""
+    path = Path(__file__).parent / "files_of_0_2_0" / f"{name}.npz"
+    with np.load(path) as pack:
+        return path, dict(pack)
+
+
+class Gust(NamedTuple):
+    wind: jax.Array
+    push: jax.Array
+
+
+def gusts(state):
+    push = jast.distributions.Independent(jast.distributions.Normal(jnp.zeros(2), 1.0), 1)
+    return jast.distributions.Joint({"w": Gust(jast.distributions.Normal(0.0, 1.0), push)})
+
+
+def test_an_archive_of_0_2_0_is_read(tmp_path):
+    sim = jast.Simulator(
+        init=lambda x0: x0,
+        step=lambda s, x: s + x["w"].wind + x["w"].push.sum(),
+        disturbance=gusts,
+        evaluate=lambda s: (jnp.abs(s) >= 2, jnp.maximum(2 - jnp.abs(s), 0)),
+        horizon=3,
+        start=lambda: jast.distributions.Normal(0.0, 1.0),
+    )
+    path, arrays = former("failures")
+    found, settings = jast.failures.load(path, sim)
+    assert settings == {"seed": 0, "nested": {"a": [1, 2]}}
+    assert (len(found), int(found.seen), found.dropped) == (3, 152, 0)
+    same(found.episodes.reward, arrays["reward.0"])
+    same(found.episodes.x0, arrays["x0.0"])
+    same(found.episodes.disturbances["w"].push, arrays["disturbances.1"])
+    for episode in found:
+        again = jast.replay(sim, episode)
+        assert again.failure and abs(float(again.log_prob) - episode.log_prob) < 1e-4
+    with pytest.raises(ValueError, match="values of the class Gust, which only its simulator can"):
+        jast.load(path)
+    jast.save(tmp_path / "now", found)
+    same(found, jast.load(tmp_path / "now", sim))
+
+
+def test_heads_of_0_2_0_are_read():
+    path, arrays = former("heads")
+    found = jast.load(path)
+    assert found.levels == 5 and found.returns is None
+    same(found.inputs.deviation, arrays["inputs.2"])
+    leaves = jax.tree.leaves(found.policy.params)
+    for i, leaf in enumerate(leaves):
+        same(leaf, arrays[f"policy.{i}"])
+    assert found.policy.apply(found.policy.params, jnp.ones(1)).shape == (1, 3)
+    assert found.value.apply(found.value.params, jnp.ones(2)).shape == ()
+
+
+def test_a_policy_of_0_2_0_is_read():
+    sim = jast.simulators.landing()
+    path, arrays = former("policy")
+    found = jast.load(path, sim)
+    for name in ("actor", "critic", "net", "tilt", "alpha", "scale"):
+        for i, leaf in enumerate(jax.tree.leaves(getattr(found.learned, name))):
+            same(leaf, arrays[f"{name}.{i}"])
+    same(found.history.invalid, arrays["history.8"])
+    assert np.isfinite(jast.rollout(KEY, sim, found).log_prob)
+    with pytest.raises(ValueError, match="does not fit sim: its horizon is 10, expected 8"):
+        jast.load(path, WALK)
+
+
+def test_a_validation_of_0_2_0_goes_on():
+    inputs = np.random.default_rng(0).normal(size=(30, 2)).astype(np.float32)
+    labels = (inputs[:, 0] > 0).astype(int)
+    path, arrays = former("state")
+    state = jast.load(path)
+    same(state.order, arrays["order"])
+    same(state.history.scores, arrays["history.scores"])
+    found = jast.weakness.validate(
+        KEY, predict, inputs, labels, budget=25, selector="random", state=state
+    )
+    assert found.calls == 25 and list(found.order[:20]) == list(arrays["order"])

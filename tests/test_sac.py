@@ -198,9 +198,7 @@ def test_a_file_that_does_not_fit_is_refused(learned, whole_run, tmp_path):
     save(path, learned)
     with pytest.raises(ValueError, match="does not fit sim: its horizon is 2, expected 6"):
         load(path, WALK)
-    with pytest.raises(
-        ValueError, match="does not fit sim: it holds a learned start, expected none"
-    ):
+    with pytest.raises(ValueError, match="does not fit sim: the start has the structure .*Tilt"):
         load(path, walk(horizon=2))
     two = jast.Simulator(
         lambda x0: jnp.stack([x0, x0]),
@@ -212,10 +210,8 @@ def test_a_file_that_does_not_fit_is_refused(learned, whole_run, tmp_path):
     )
     with pytest.raises(ValueError, match="does not fit sim: actor"):
         load(path, two)
-    with pytest.raises(ValueError, match="is not a file of a jast failure policy"):
+    with pytest.raises(ValueError, match="is not a file of jast.save but a folder"):
         load(whole_run[2], WALK)
-    with pytest.raises(ValueError, match="save: policy must .*received Policy"):
-        save(path, jast.Policy(_start, lambda s, t: _disturbance(s)))
 
 
 @pytest.mark.long

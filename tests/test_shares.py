@@ -208,8 +208,8 @@ def test_a_share_in_words_and_in_files(key):
     assert first._replace(share_interval=UNKNOWN).share_words == "52 %"
     assert first._replace(share=1.0, share_interval=(1.0, 1.0)).share_words == "100 %"
     arrays, bare = {}, first._replace(failure=None)
-    node = codec.encode(bare, arrays, lambda value: None)
-    again = lambda: codec.decode(node, "file", arrays, lambda node: node, None)
+    node = codec.encode(bare, arrays)
+    again = lambda: codec.decode(node, "file", arrays, codec.Given())
     assert again() == bare
     del node["record"][1]["share_interval"]  # as before there were any
     assert np.isnan(again().share_interval).all() and again().share == bare.share

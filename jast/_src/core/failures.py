@@ -8,8 +8,6 @@ dtype whatever the precision that JAX is set to.
 
 from __future__ import annotations
 
-import json
-import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from operator import index
@@ -24,7 +22,6 @@ from jast._src.core.simulator import Simulator
 from jast._src.io import save_load
 from jast._src.io.data_frames import dataframe
 from jast._src.io.export import by_step, from_json, to_csv, to_numpy
-from jast._src.io.npz import arrays_of, check_part, describe, named
 from jast._src.util import display
 
 if TYPE_CHECKING:
@@ -45,8 +42,7 @@ __all__ = [
     "to_numpy",
 ]
 
-SCALARS = ("log_prob", "distance", "failure", "length", "reward")  # of an episode, in a file
-ROWS = ("counts", "tree", "simulation")  # of an archive, in a file
+ROWS = ("counts", "tree", "simulation")
 
 
 @display.printable("seen")
@@ -316,10 +312,10 @@ def save(path: PathLike, failures: Failures, settings: dict[str, Any] | None = N
     Args:
         path: of the file.
         failures: the archive.
-        settings: a dict that JSON can hold: method, seed, counts ...
+        settings: a dict that a file can hold: method, seed, counts ...
 
     Raises:
-        ValueError: for settings that JSON cannot hold.
+        ValueError: for settings that it cannot hold.
 
     Example:
         >>> import os, tempfile, jax, jast
@@ -328,11 +324,7 @@ def save(path: PathLike, failures: Failures, settings: dict[str, Any] | None = N
         >>> with tempfile.TemporaryDirectory() as folder:
         ...     jast.failures.save(os.path.join(folder, "failures.npz"), found)
     """
-    try:
-        settings = json.loads(json.dumps({} if settings is None else settings, default=_plain))
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"save: settings must be a dict that JSON can hold: {error}") from None
-    save_load.store(path, "jast failures", failures, settings=settings)
+    save_load.store(path, failures, settings=settings or {})
 
 
 def load(path: PathLike, sim: Simulator | None = None) -> tuple[Failures, dict[str, Any]]:
@@ -356,39 +348,8 @@ def load(path: PathLike, sim: Simulator | None = None) -> tuple[Failures, dict[s
         ...     jast.failures.load(path, sim)[1]
         {'seed': 0}
     """
-    failures, header = save_load.restore(path, "jast failures", sim)
-    return failures, header["settings"]
-
-
-def parts(failures: Failures) -> tuple[dict, dict[str, np.ndarray]]:
-    """Header and arrays of an archive's file."""
-    e = failures.episodes
-    arrays = {name: getattr(e, name) for name in ("x0", "disturbances", *SCALARS)}
-    arrays |= {name: getattr(failures, name) for name in ROWS}
-    header = dict(settings={}, seen=int(failures.seen), dropped=int(failures.dropped))
-    header["structure"] = {name: describe(getattr(e, name)) for name in ("x0", "disturbances")}
-    return header, named(arrays)
-
-
-def whole(
-    path: str | os.PathLike, header: dict, arrays: dict[str, np.ndarray], sim: Simulator | None
-) -> Failures:
-    """The archive of `parts`; ValueError where it does not fit ``sim``, or needs one."""
-    x0, x = (arrays_of(arrays, name) for name in ("x0", "disturbances"))
-    structure = header["structure"]
-    if sim is not None:
-        like = outline(sim)
-        check_part(path, "x0", structure["x0"], x0, like.x0, ())
-        check_part(path, "disturbances", structure["disturbances"], x, like.x, (sim.horizon,))
-        x0, x = jax.tree.structure(like.x0).unflatten(x0), jax.tree.structure(like.x).unflatten(x)
-    else:
-        x0, x = (
-            _rebuild(path, structure["x0"], iter(x0)),
-            _rebuild(path, structure["disturbances"], iter(x)),
-        )
-    episodes = Episode(x0, x, **{name: arrays[f"{name}.0"] for name in SCALARS})
-    rows = {name: arrays[f"{name}.0"] for name in ROWS}
-    return Failures(episodes, **rows, seen=header["seen"], dropped=header["dropped"])
+    failures, beside = save_load.restore(path, sim)
+    return failures, beside.get("settings", {})
 
 
 def _take(episodes, i):
@@ -438,27 +399,3 @@ def _best(caller, failures, top):
         seen=0,
         dropped=0,
     )
-
-
-def _plain(value):
-    """NumPy's and JAX's numbers and arrays as JSON has them."""
-    if hasattr(value, "tolist"):
-        return value.tolist()
-    raise TypeError(f"{type(value).__name__} {value!r} is not a number, text, list or dict")
-
-
-def _rebuild(path, structure, leaves):
-    if structure == "array":
-        return next(leaves)
-    kind, names, below = structure
-    if kind.startswith("the class"):
-        raise ValueError(
-            f"load: {path} holds values of {kind}, which only its simulator can restore: load(path,"
-            " sim)"
-        )
-    below = [_rebuild(path, child, leaves) for child in below]
-    if kind == "None":
-        return None
-    if kind == "dict":
-        return dict(zip(names, below, strict=True))
-    return tuple(below) if kind == "tuple" else below

@@ -15,26 +15,13 @@ import zipfile
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
 if TYPE_CHECKING:
     from jast._src.core.typing import PathLike
 
-__all__ = [
-    "arrays_of",
-    "check_array",
-    "check_part",
-    "check_structure",
-    "children_of",
-    "describe",
-    "named",
-    "pack",
-    "read",
-    "unpack",
-    "write",
-]
+__all__ = ["pack", "read", "unpack", "write"]
 
 Header = dict[str, Any]
 Arrays = dict[str, np.ndarray]
@@ -129,91 +116,6 @@ def unpack(
     if header.pop("sha256", None) != _checksum(header, arrays):
         raise ValueError(f"load: {path} is damaged: its checksum does not match")
     return header, arrays
-
-
-def named(parts: Mapping[str, Any]) -> Arrays:
-    """The arrays of a dict of pytrees, by the names "part.0", "part.1" ..."""
-    return {
-        f"{name}.{i}": np.asarray(leaf)
-        for name, part in parts.items()
-        for i, leaf in enumerate(jax.tree.leaves(part))
-    }
-
-
-def arrays_of(arrays: Arrays, name: str) -> list[np.ndarray]:
-    """The arrays of the part ``name`` of `named`."""
-    return [arrays[f"{name}.{i}"] for i in range(sum(key.startswith(f"{name}.") for key in arrays))]
-
-
-def children_of(node: Any) -> tuple[list[str], list | None]:
-    """Names and children of a node of a pytree; None in place of the children of a leaf."""
-    pairs, _ = jax.tree_util.tree_flatten_with_path(node, is_leaf=lambda child: child is not node)
-    if len(pairs) == 1 and pairs[0][1] is node:
-        return [], None
-    return [jax.tree_util.keystr(path) for path, _ in pairs], [child for _, child in pairs]
-
-
-def describe(tree: Any) -> Any:
-    """A pytree's structure in JSON: its nodes as [kind, names, children], an array as "array"."""
-    if tree is None:
-        return ["None", [], []]
-    names, children = children_of(tree)
-    if children is None:
-        return "array"
-    kind = f"the class {type(tree).__name__}"
-    if type(tree) is dict and all(isinstance(key, str) for key in tree):
-        kind, names = "dict", sorted(tree)
-    elif type(tree) in (tuple, list):
-        kind, names = type(tree).__name__, []
-    return [kind, names, [describe(child) for child in children]]
-
-
-def check_structure(path: PathLike, other: str, name: str, structure: Any, like: Any) -> None:
-    """ValueError unless ``structure``, of `describe`, is that of the pytree ``like``. ``other`` is
-    the argument that must fit, ``name`` a part of the file.
-    """
-    expected = describe(like)
-    if structure != expected:
-        raise ValueError(
-            f"load: {path} does not fit {other}: {name} has the structure {structure}, expected"
-            f" {expected}"
-        )
-
-
-def check_array(
-    path: PathLike, other: str, name: str, a: np.ndarray, like: Any, axes: int = 0
-) -> None:
-    """ValueError unless ``a``, without its first ``axes``, has the shape and the kind of number of
-    ``like``; the precision may differ.
-    """
-    shape = a.shape[axes:]
-    if shape != like.shape or _kind_of_number(a.dtype) != _kind_of_number(like.dtype):
-        raise ValueError(
-            f"load: {path} does not fit {other}: {name} has {a.dtype.name}{list(shape)}, expected"
-            f" {like.dtype.name}{list(like.shape)}"
-        )
-
-
-def check_part(
-    path: PathLike,
-    name: str,
-    structure: Any,
-    arrays: list[np.ndarray],
-    like: Any,
-    rows: tuple[int, ...],
-    axes: int = 1,
-) -> None:
-    """ValueError unless ``arrays``, the leaves of a part of this ``structure``, are those of the
-    simulator's value ``like``: after the first ``axes``, ``rows`` and then the shape of a value.
-    """
-    check_structure(path, "sim", name, structure, like)
-    for a, s in zip(arrays, jax.tree.leaves(like), strict=True):
-        check_array(path, "sim", name, a, jax.ShapeDtypeStruct((*rows, *s.shape), s.dtype), axes)
-
-
-def _kind_of_number(dtype: Any) -> Any:
-    kinds = jnp.floating, jnp.signedinteger, jnp.unsignedinteger
-    return next((kind for kind in kinds if jnp.issubdtype(dtype, kind)), dtype)
 
 
 def _entries(format: str, version: int, header: Header, arrays: Arrays) -> Arrays:

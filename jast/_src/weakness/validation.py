@@ -12,6 +12,7 @@ import jax
 import numpy as np
 
 from jast._src.core.counter_prng import numpy_generator
+from jast._src.io import save_load
 from jast._src.runtime.checkpoints import open_checkpoint
 from jast._src.runtime.progress_bar import Watch, terminable
 from jast._src.util.checks import check_random_key, whole_number
@@ -19,8 +20,6 @@ from jast._src.weakness.data import are_indices, check_data, fingerprint
 from jast._src.weakness.measures import auc
 from jast._src.weakness.result import History, Result, State
 from jast._src.weakness.selector_contract import Seen, Selector
-from jast._src.weakness.storage import parts
-from jast._src.weakness.storage import whole as restored
 
 if TYPE_CHECKING:
     import chex
@@ -117,7 +116,7 @@ def validate(
     with open_checkpoint("validate", checkpoint, key, **about) as store, terminable():
         kept = None if store is None else store.state()
         if kept is not None:
-            state = restored("", *kept, None)
+            state = save_load.whole(checkpoint, *kept)
         elif state is None:
             state = _begin(key, data, chosen)
         budget = max(budget, len(state.order))
@@ -206,7 +205,7 @@ def _run(state, selector, data, predict, budget, store, progress, callback):
 
     def keep():
         if store is not None:
-            store.replace(*parts(kept()))
+            store.replace(*save_load.parts(kept()))
 
     current = seen
 
