@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 
 from jast import distributions as D
-from jast._src.core import transition as progress
+from jast._src.core import transition
 from jast._src.core.rewards import log_likelihood
 from jast._src.core.simulator import Simulator
 from jast._src.distributions.mixtures import x_of
@@ -30,7 +30,7 @@ __all__ = [
 class Lane(NamedTuple):
     """An episode at a state, and what a learner asks of it."""
 
-    progress: progress.Progress
+    progress: transition.Progress
     """The episode so far."""
     t: jax.Array
     """int32: steps taken."""
@@ -80,7 +80,7 @@ class Transitions(NamedTuple):
 
 def lane_at(sim: Simulator, dense_reward: bool, x0: Any, drift: Any = ()) -> Lane:
     """A `Lane` at the start ``x0``; ``dense_reward``: the distance counts at every state."""
-    episode = progress.begin(sim, log_likelihood, x0)
+    episode = transition.begin(sim, log_likelihood, x0)
     return _lane(sim, dense_reward, episode, jnp.int32(0), drift, jnp.zeros((), jnp.float32))
 
 
@@ -101,7 +101,7 @@ def step_lane(
     A lane that was ``over`` stays as it is.
     """
     x = x_of(sim.disturbance(lane.progress.state), z)
-    after = progress.advance(sim, log_likelihood, lane.progress, x, lane.t + 1 >= sim.horizon)
+    after = transition.advance(sim, log_likelihood, lane.progress, x, lane.t + 1 >= sim.horizon)
     log_p = lane.log_p - 0.5 * jnp.sum(z**2)
     finite = _finite(z, *jax.tree.leaves(x))
     moved = _lane(sim, dense_reward, after, lane.t + 1, lane.drift, log_p, ~lane.over, finite)
@@ -126,7 +126,7 @@ def _lane(sim, dense_reward, episode, t, drift, log_p, live=True, finite=True):
     """The `Lane` of an ``episode``, without a gain; invalid unless its disturbance is ``finite``,
     and what the learner would see.
     """
-    episode = progress.conclude(sim, log_likelihood, episode, live)
+    episode = transition.conclude(sim, log_likelihood, episode, live)
     if sim.episodic and not dense_reward:
         distance = episode.distance  # evaluated at its end alone
     else:

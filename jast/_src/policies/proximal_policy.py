@@ -2,25 +2,21 @@
 
 from __future__ import annotations
 
-import functools
-import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Literal
 
 import jax
 import jax.numpy as jnp
 
-from jast._src.core.check import OBSERVED, contract
-from jast._src.core.signature import outline
 from jast._src.core.simulator import Simulator
-from jast._src.policies import proximal_training, settings
-from jast._src.policies.actor import count_latents, make_networks
+from jast._src.policies import proximal_training
+from jast._src.policies.actor import make_networks
 from jast._src.policies.failure_policy import FailurePolicy
 from jast._src.policies.lanes import empty_buffer
+from jast._src.policies.settings import Asked, is_auto
 from jast._src.policies.train_policy import Method, train_policy
-from jast._src.policies.training_state import Config, explore, init_training
+from jast._src.policies.training_state import explore, init_training
 from jast._src.runtime.memory import require, size
-from jast._src.util.checks import check_random_key, whole_number
 
 if TYPE_CHECKING:
     import chex
@@ -112,36 +108,28 @@ def ppo(
         >>> jast.rollout(jax.random.key(1), sim, policy).disturbances.shape
         (30,)
     """
-    check_random_key("ppo", key)
-    contract("ppo", sim, observed=OBSERVED)
-    if settings.is_auto(steps):
+    asked = Asked("ppo", key, sim)
+    if is_auto(steps):
         steps = min(sim.horizon, MOST_STEPS)
-    counts = dict(episodes=episodes, batch=batch, epochs=epochs, components=components, steps=steps)
-    episodes, batch, epochs, components, steps = (
-        whole_number("ppo", name, value) for name, value in counts.items()
+    episodes, batch, epochs, components, steps = asked.counts(
+        episodes=episodes, batch=batch, epochs=epochs, components=components, steps=steps
     )
-    if settings.is_auto(lanes):
+    if is_auto(lanes):
         lanes = episodes * sim.horizon // (steps * ITERATIONS)
         lanes = min(max(FEWEST_LANES, lanes), MOST_LANES)
-    lanes = whole_number("ppo", "lanes", lanes)
-    plan = settings.make_plan("ppo", episodes, sim.horizon, lanes, steps)
-    hidden = settings.check_hidden("ppo", hidden)
-    dense_reward = settings.check_shaping("ppo", shaping, sim)
-    number = functools.partial(settings.check_number, "ppo")
-    positive = functools.partial(settings.check_positive, "ppo")
+    (lanes,) = asked.counts(lanes=lanes)
+    plan = asked.plan(episodes, lanes, steps)
+    sizes = dict(lanes=lanes, components=components, batch=batch, capacity=max(EXPLORED, lanes))
+    config = asked.networks(hidden, shaping, **sizes)
     rates = proximal_training.Rates(
-        learning_rate=positive("learning_rate", learning_rate),
-        clip=number("clip", clip, lambda v: 0 < v < 1, "above 0 and below 1"),
-        trace=number("trace", trace, lambda v: 0 <= v <= 1, "of 0 to 1"),
-        alpha=positive("alpha", alpha),
-        bonus=number("bonus", bonus, math.isfinite, "that is finite"),
+        learning_rate=asked.positive("learning_rate", learning_rate),
+        clip=asked.number("clip", clip, lambda v: 0 < v < 1, "above 0 and below 1"),
+        trace=asked.number("trace", trace, lambda v: 0 <= v <= 1, "of 0 to 1"),
+        alpha=asked.positive("alpha", alpha),
+        bonus=asked.finite("bonus", bonus),
         total=float(plan.total),
     )
-    n, n0 = count_latents(sim, "ppo")
-    (m,) = outline(sim).observation
-    learning = dict(hidden=hidden, components=components, dense_reward=dense_reward, batch=batch)
-    config = Config(m=m, n=n, n0=n0, lanes=lanes, capacity=max(EXPLORED, lanes), **learning)
-    _, networks = make_networks(n, hidden, components)
+    _, networks = make_networks(config.n, config.hidden, components)
     act, criticise = networks
     traced = jax.tree.map(jnp.float32, rates)
 
@@ -153,11 +141,11 @@ def ppo(
             key, sim, config, steps, epochs, networks, traced, training, n // steps
         )
 
-    needed = jax.eval_shape(begin, key), jax.eval_shape(lambda: empty_buffer(steps * lanes, m, n))
+    batches = jax.eval_shape(lambda: empty_buffer(steps * lanes, config.m, config.n))
+    needed = size(jax.eval_shape(begin, key)) + size(batches)
     held = f"{steps} steps of {lanes} lanes between updates, and the networks"
-    require("ppo", 2 * sum(map(size, needed)), held, "use fewer lanes or steps")
+    require("ppo", 2 * needed, held, "use fewer lanes or steps")
     method = Method(
-        function="ppo",
         actor=act,
         begin=begin,
         explore=lambda key, *args: explore(key, sim, config, act, *args),
@@ -168,4 +156,4 @@ def ppo(
     )
     course = dict(scale=scale, widen=widen, progress=progress, callback=callback)
     about = dict(steps=steps, epochs=epochs, rates=rates)
-    return train_policy(key, sim, method, config, plan, about, checkpoint=checkpoint, **course)
+    return train_policy(key, asked, method, config, plan, checkpoint=checkpoint, **course, **about)

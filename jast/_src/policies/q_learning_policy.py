@@ -4,7 +4,6 @@ learner that Lipkis and Agogino (NASA) name beside soft actor-critic.
 
 from __future__ import annotations
 
-import functools
 import math
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any, Literal
@@ -13,16 +12,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jast._src.core.check import OBSERVED, contract
-from jast._src.core.signature import outline
 from jast._src.core.simulator import Simulator
-from jast._src.policies import q_learning_training, settings
-from jast._src.policies.actor import count_latents
+from jast._src.policies import q_learning_training
 from jast._src.policies.failure_policy import FailurePolicy
+from jast._src.policies.settings import Asked, is_auto
 from jast._src.policies.train_policy import Method, train_policy
-from jast._src.policies.training_state import Config, explore
+from jast._src.policies.training_state import explore
 from jast._src.runtime.memory import require
-from jast._src.util.checks import check_random_key, whole_number
+from jast._src.util.checks import whole_number
 
 if TYPE_CHECKING:
     import chex
@@ -111,33 +108,27 @@ def q_learning(
         >>> jast.rollout(jax.random.key(1), sim, policy).disturbances.shape
         (10,)
     """
-    check_random_key("q_learning", key)
-    contract("q_learning", sim, observed=OBSERVED)
-    counts = dict(episodes=episodes, lanes=lanes)
-    episodes, lanes = (whole_number("q_learning", name, value) for name, value in counts.items())
+    asked = Asked("q_learning", key, sim)
+    episodes, lanes = asked.counts(episodes=episodes, lanes=lanes)
     values = whole_number("q_learning", "values", values, 2)
-    plan = settings.make_plan("q_learning", episodes, sim.horizon, lanes)
-    number = functools.partial(settings.check_number, "q_learning")
+    plan = asked.plan(episodes, lanes)
     rates = q_learning_training.Rates(
-        learning_rate=number(
+        learning_rate=asked.number(
             "learning_rate", learning_rate, lambda v: 0 < v <= 1, "above 0 and at most 1"
         ),
-        epsilon=number("epsilon", epsilon, lambda v: 0 <= v <= 1, "of 0 to 1"),
+        epsilon=asked.number("epsilon", epsilon, lambda v: 0 <= v <= 1, "of 0 to 1"),
         total=float(plan.total),
     )
-    reach = settings.check_positive("q_learning", "reach", reach)
-    n, n0 = count_latents(sim, "q_learning")
-    (m,) = outline(sim).observation
-    ranges = _ranges(ranges, m)
-    cell, rows = _cells(cells, cell, m, sim.horizon)
+    reach = asked.positive("reach", reach)
+    n, ranges = asked.n, _ranges(ranges, asked.m)
+    cell, rows = _cells(cells, cell, asked.m, sim.horizon)
     kept = f"a table of {rows} cells and {values}^{n} values of the disturbance"
     require("q_learning", 8 * rows * values**n, kept, "use fewer cells or values")
-    config = Config(m=m, n=n, n0=n0, lanes=lanes, capacity=max(EXPLORED, lanes))
+    config = asked.config(lanes=lanes, capacity=max(EXPLORED, lanes))
     actor = q_learning_training.greedy_actor(cell, sim.horizon)
     traced = jax.tree.map(jnp.float32, rates)
     actions = q_learning_training.action_grid(n, values, reach)
     method = Method(
-        function="q_learning",
         actor=actor,
         begin=lambda key: q_learning_training.begin_table_training(key, sim, config, rows, actions),
         explore=lambda key, *args: explore(key, sim, config, actor, *args),
@@ -148,12 +139,12 @@ def q_learning(
     )
     course = dict(scale=scale, widen=widen, progress=progress, callback=callback)
     about = dict(rates=rates, cell=cell, rows=rows, ranges=ranges, values=values, reach=reach)
-    return train_policy(key, sim, method, config, plan, about, checkpoint=checkpoint, **course)
+    return train_policy(key, asked, method, config, plan, checkpoint=checkpoint, **course, **about)
 
 
 def _ranges(ranges: Any, m: int) -> np.ndarray | None:
     """[m, 2], or None for "auto"."""
-    if settings.is_auto(ranges):
+    if is_auto(ranges):
         return None
     try:
         known = np.asarray(ranges, np.float64)

@@ -5,23 +5,20 @@ arXiv:1812.05905).
 from __future__ import annotations
 
 import functools
-import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Literal
 
 import jax
 import jax.numpy as jnp
 
-from jast._src.core.check import OBSERVED, contract
-from jast._src.core.signature import outline
 from jast._src.core.simulator import Simulator
-from jast._src.policies import settings, soft_actor_critic_training
-from jast._src.policies.actor import count_latents, make_networks
+from jast._src.policies import soft_actor_critic_training
+from jast._src.policies.actor import make_networks
 from jast._src.policies.failure_policy import FailurePolicy
+from jast._src.policies.settings import Asked, is_auto
 from jast._src.policies.train_policy import Method, train_policy
-from jast._src.policies.training_state import Config, init_training
+from jast._src.policies.training_state import init_training
 from jast._src.runtime.memory import require, size
-from jast._src.util.checks import check_random_key, whole_number
 
 if TYPE_CHECKING:
     import chex
@@ -128,36 +125,26 @@ def sac(
         >>> jast.rollout(jax.random.key(1), sim, policy).disturbances.shape
         (30,)
     """
-    check_random_key("sac", key)
-    contract("sac", sim, observed=OBSERVED)
-    counts = dict(episodes=episodes, lanes=lanes, batch=batch, buffer=buffer, components=components)
-    episodes, lanes, batch, buffer, components = (
-        whole_number("sac", name, value) for name, value in counts.items()
+    asked = Asked("sac", key, sim)
+    episodes, lanes, batch, buffer, components = asked.counts(
+        episodes=episodes, lanes=lanes, batch=batch, buffer=buffer, components=components
     )
-    plan = settings.make_plan("sac", episodes, sim.horizon, lanes)
-    hidden = settings.check_hidden("sac", hidden)
-    dense_reward = settings.check_shaping("sac", shaping, sim)
-    auto_alpha = settings.is_auto(alpha)
-    number = functools.partial(settings.check_number, "sac")
-    positive = functools.partial(settings.check_positive, "sac")
+    plan = asked.plan(episodes, lanes)
+    sizes = dict(lanes=lanes, components=components, batch=batch, capacity=max(buffer, lanes))
+    config = asked.networks(hidden, shaping, **sizes)
+    auto_alpha = is_auto(alpha)
     rates = soft_actor_critic_training.Rates(
-        learning_rate=positive("learning_rate", learning_rate),
-        polyak=number("polyak", polyak, lambda v: 0 < v <= 1, "above 0 and at most 1"),
-        alpha=1.0 if auto_alpha else positive("alpha", alpha),
-        entropy=number("entropy", entropy, math.isfinite, "that is finite"),
-        bonus=number("bonus", bonus, math.isfinite, "that is finite"),
+        learning_rate=asked.positive("learning_rate", learning_rate),
+        polyak=asked.number("polyak", polyak, lambda v: 0 < v <= 1, "above 0 and at most 1"),
+        alpha=1.0 if auto_alpha else asked.positive("alpha", alpha),
+        entropy=asked.finite("entropy", entropy),
+        bonus=asked.finite("bonus", bonus),
         adapt=float(auto_alpha),
         acts=float(plan.nominal + plan.exploration + int(CRITICS_ALONE * plan.learning)),
         total=float(plan.total),
     )
-    if settings.is_auto(updates):
-        updates = -(-UPDATES // plan.learning)
-    updates = whole_number("sac", "updates", updates)
-    n, n0 = count_latents(sim, "sac")
-    (m,) = outline(sim).observation
-    learning = dict(hidden=hidden, components=components, dense_reward=dense_reward, batch=batch)
-    config = Config(m=m, n=n, n0=n0, lanes=lanes, capacity=max(buffer, lanes), **learning)
-    _, networks = make_networks(n, hidden, components)
+    (updates,) = asked.counts(updates=-(-UPDATES // plan.learning) if is_auto(updates) else updates)
+    _, networks = make_networks(config.n, config.hidden, components)
     traced = jax.tree.map(jnp.float32, rates)
 
     def begin(key):
@@ -174,7 +161,6 @@ def sac(
     kept = f"a buffer of {config.capacity} steps and the networks"
     require("sac", 2 * size(jax.eval_shape(begin, key)), kept, "use a smaller buffer")
     method = Method(
-        function="sac",
         actor=networks[0],
         begin=begin,
         explore=functools.partial(learn, updates=0),
@@ -184,10 +170,10 @@ def sac(
             training.learner.target,
             jnp.exp(training.learner.log_alpha),
         ),
-        start_value=soft_actor_critic_training.start_value(networks, n),
+        start_value=soft_actor_critic_training.start_value(networks, config.n),
         bonus=bonus,
         keeps_buffer=True,
     )
     course = dict(scale=scale, widen=widen, progress=progress, callback=callback)
     about = dict(updates=updates, rates=rates)
-    return train_policy(key, sim, method, config, plan, about, checkpoint=checkpoint, **course)
+    return train_policy(key, asked, method, config, plan, checkpoint=checkpoint, **course, **about)

@@ -11,8 +11,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jast._src.core.simulator import Simulator
-from jast._src.io.npz import arrays_of, named
 from jast._src.policies.failure_policy import (
     FailurePolicy,
     History,
@@ -21,7 +19,7 @@ from jast._src.policies.failure_policy import (
     assemble,
     history_of,
 )
-from jast._src.policies.settings import Plan, check_scale, check_widen
+from jast._src.policies.settings import Asked, Plan
 from jast._src.policies.training_state import (
     Config,
     Totals,
@@ -48,8 +46,6 @@ ROUNDING = 3e-3  # relative deviation of the miss distance that may be rounding 
 class Method(NamedTuple):
     """What differs between the ways of learning a policy. A key is that of a whole part."""
 
-    function: str
-    """Its public name."""
     actor: Callable
     """``apply`` of the actor."""
     begin: Callable[[jax.Array], TrainingState]
@@ -71,22 +67,23 @@ class Method(NamedTuple):
 
 def train_policy(
     key: jax.Array,
-    sim: Simulator,
+    asked: Asked,
     method: Method,
     config: Config,
     plan: Plan,
-    about: dict[str, Any],
     *,
     scale: Any,
     widen: Any,
     progress: bool,
     callback: Callable[..., Any] | None,
     checkpoint: Any,
+    **about: Any,
 ) -> FailurePolicy:
-    """The policy that ``method`` teaches; ``scale``, ``widen``: as the user gave them.
+    """The policy that ``method`` teaches; from ``scale`` to ``checkpoint`` as the user gave them.
     ``about``: what else a checkpoint must agree with.
     """
-    scale, widen = check_scale(method.function, scale), check_widen(method.function, widen)
+    function, sim = asked.function, asked.sim
+    scale, widen = asked.scale(scale), asked.widen(widen)
     for_begin, for_steps, for_start = jax.random.split(key, 3)
     method = method._replace(
         begin=functools.partial(method.begin, for_begin),
@@ -94,9 +91,13 @@ def train_policy(
         learn=functools.partial(method.learn, for_steps),
     )
     about = dict(sim=sim, config=config, plan=plan, scale=scale, widen=widen) | about
-    with open_checkpoint(method.function, checkpoint, key, **about) as store:
+    with open_checkpoint(function, checkpoint, key, **about) as store:
         kept = _resume(method, store) or _explore(method, plan, sim.horizon, scale, widen)
-        training, rows = _learn(method, plan, kept, scale is None, progress, callback, store)
+        total = plan.total * config.lanes
+        watch = Watch(
+            function, total, "step", progress, callback, done=int(kept[0].step) * config.lanes
+        )
+        training, rows = _learn(method, plan, kept, scale is None, watch, store)
     tilt = ()
     if config.n0:
         bonus = jnp.float32(method.bonus)
@@ -139,19 +140,11 @@ def _explore(method, plan, horizon, scale, widen):
     return training if method.keeps_buffer else training._replace(buffer=()), rows
 
 
-def _learn(method, plan, kept, auto_scale, progress, callback, store):
+def _learn(method, plan, kept, auto_scale, watch, store):
     """``(TrainingState, rows)`` after all chunks; ``kept``: those before. ``store``
     keeps them after each chunk.
     """
     lanes = kept[0].lanes.t.shape[0]
-    watch = Watch(
-        method.function,
-        plan.total * lanes,
-        "step",
-        progress,
-        callback,
-        done=int(kept[0].step) * lanes,
-    )
     try:
         with terminable():
             while (left := plan.total - int(kept[0].step)) > 0:
@@ -167,7 +160,8 @@ def _learn(method, plan, kept, auto_scale, progress, callback, store):
                 # in one statement: an interruption finds all of a chunk or nothing
                 kept = training, rows
                 if store is not None:
-                    store.replace({}, named(dict(training=training, rows=rows)))
+                    leaves = enumerate(jax.tree.leaves(kept))
+                    store.replace({}, {str(i): np.asarray(a) for i, a in leaves})
                 failing, log_p = f"{last.failing_share:.1%}", f"{last.log_p:.4g}"
                 watch.reach(int(training.step) * lanes, failing=failing, log_p=log_p)
                 watch.tell(lambda rows=rows: history_of(rows[1:]))
@@ -186,5 +180,5 @@ def _resume(method, store):
         return None
     like = jax.eval_shape(method.begin)
     like = like if method.keeps_buffer else like._replace(buffer=())
-    leaves, (rows,) = (arrays_of(state[1], name) for name in ("training", "rows"))
+    *leaves, rows = (state[1][str(i)] for i in range(len(state[1])))
     return jax.tree.structure(like).unflatten(map(jnp.asarray, leaves)), rows
