@@ -7,7 +7,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from jast import distributions as D
-from jast._src.cross_entropy import gaussian
 from jast._src.cross_entropy.gaussian import (
     Gaussian,
     as_gaussian,
@@ -324,12 +323,3 @@ def test_one_point_many_times_has_no_spread(value, w, double):
     with jax.enable_x64(double):
         old = normal(jnp.asarray([3.0]), 2.0)
         assert same(FIT(old, jnp.full((7, 1), value), jnp.asarray(w)), old)
-
-
-def test_shapes_that_do_not_fit():
-    g = normal(jnp.zeros(2), 1.0)
-    for x, w in (((5, 3), (5,)), ((5, 2), (4,)), ((2,), (2,)), ((5, 2), (5, 1))):
-        with pytest.raises(
-            ValueError, match=r"gaussian.fit: x must be \[n, 2\] and weights \[n\], received"
-        ):
-            gaussian.fit(g, jnp.zeros(x), jnp.zeros(w))

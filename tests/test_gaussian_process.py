@@ -151,22 +151,6 @@ def test_it_vmaps():
         np.testing.assert_allclose(both[i], one, rtol=2e-2, atol=2e-2)
 
 
-def test_bad_input_is_named():
-    x, y = jnp.zeros((4, 2)), jnp.zeros(4)
-    with pytest.raises(
-        ValueError,
-        match=(
-            r"surrogates.fit_process: kernel must be one of \['squared exponential', .*received"
-            r" 'cubic'"
-        ),
-    ):
-        fit_process(x, y, y == 0, (1.0,), kernel="cubic")
-    with pytest.raises(
-        ValueError, match=r"x must be \[n, d\], y and mask \[n\], received \(4, 2\), \(3,\)"
-    ):
-        fit_process(x, y[:3], y == 0, (1.0,))
-
-
 @pytest.mark.parametrize(
     "kind, detail",
     [

@@ -403,45 +403,6 @@ def test_one_component_is_a_gaussian(dtype, key):
     np.testing.assert_allclose(got.covariances[0], fitted.covariance, rtol=1e-4, atol=1e-5)
 
 
-@pytest.mark.parametrize(
-    "given, expected",
-    [
-        (dict(iterations=-1), "a whole number of at least 0, received -1"),
-        (dict(iterations=2.0), "a whole number"),
-        (dict(iterations=True), "a whole number"),
-        (dict(regularisation=-1e-3), "a number of at least 0"),
-        (dict(least=np.nan), "a number of at least 0"),
-        (dict(least=np.ones(3)), "a number of at least 0"),
-    ],
-)
-def test_bad_settings(given, expected):
-    with pytest.raises(ValueError, match=f"mixture.em: {next(iter(given))} must be {expected}"):
-        em(three("float32"), jnp.zeros((5, 2)), jnp.ones(5), **given)
-
-
-def test_shapes_that_do_not_fit():
-    m = three("float32")
-    for x, w in (((5, 3), (5,)), ((5, 2), (4,)), ((2,), (2,))):
-        with pytest.raises(
-            ValueError,
-            match=r"mixture.em: x must be \[n, 2\] and its weights \[n\], received",
-        ):
-            em(m, jnp.zeros(x), jnp.zeros(w))
-    for bad in (
-        m._replace(weights=jnp.ones(2)),
-        m._replace(covariances=jnp.ones((3, 2))),
-        m._replace(means=jnp.ones(3)),
-    ):
-        with pytest.raises(
-            ValueError,
-            match=(
-                r"mixture.em: weights must be \[k\], means \[k, d\] and covariances"
-                r" \[k, d, d\], received"
-            ),
-        ):
-            em(bad, jnp.zeros((5, 2)), jnp.ones(5))
-
-
 def test_a_soft_count_of_exactly_the_least_is_enough(dtype):
     x = jnp.asarray(np.random.default_rng(0).normal(size=(6, 2)), dtype)
     one = Mixture(jnp.ones(1, dtype), jnp.zeros((1, 2), dtype), 9 * jnp.eye(2, dtype=dtype)[None])

@@ -184,13 +184,8 @@ def fit(g: Gaussian, x: jax.Array, weights: jax.Array) -> Gaussian:
 
     The old ``g`` stays where that has no answer: total weight 0, at most d rows of positive weight,
     a covariance that `is_definite` refuses, a number that is not finite. Rows of weight 0 may hold
-    anything, NaN too. Only the weights' ratios matter. ValueError for shapes that do not fit.
+    anything, NaN too. Only the weights' ratios matter.
     """
-    if x.ndim != 2 or x.shape[1:] != g.mean.shape or weights.shape != x.shape[:1]:
-        raise ValueError(
-            f"gaussian.fit: x must be [n, {g.mean.size}] and weights [n], received {x.shape} and"
-            f" {weights.shape}"
-        )
     n, d = x.shape
     if n == 0:
         return g

@@ -4,6 +4,7 @@ objectives in JAX, and as ask and tell for any other.
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias
@@ -24,7 +25,6 @@ if TYPE_CHECKING:
     from jast._src.cross_entropy.mixture import Mixture
     from jast._src.cross_entropy.result import CEResult
 
-Surrogate: TypeAlias = Literal["gaussian process", "linear", "polynomial", "radial basis"]
 Proposal: TypeAlias = "Gaussian | Mixture | tuple[chex.Array, chex.Numeric] | DistributionLike"
 
 __all__ = ["Search", "ask", "ce_method", "ce_mixture", "ce_surrogate", "finish", "start", "tell"]
@@ -90,30 +90,7 @@ def ce_method(
 
 
 def ce_surrogate(
-    key: chex.PRNGKey,
-    objective: Objective,
-    proposal: Proposal,
-    *,
-    samples: int = 10,
-    elites: int = 5,
-    iterations: int = 10,
-    schedule: Schedule | Sequence[int] | None = None,
-    mode: Literal["default", "thesis"] = "default",
-    surrogate: Surrogate | None = None,
-    kernel: Literal["squared exponential", "matern12", "matern32", "matern52"] | None = None,
-    degree: int | None = None,
-    basis: Literal["gaussian", "linear", "squared", "multiquadratic"] | None = None,
-    memory: int | None = None,
-    best: int | None = None,
-    warp: Literal["raw", "standard", "rank"] | None = None,
-    frame: Literal["window", "initial"] | None = None,
-    selection: float | Literal["elites", "dimension"] | None = None,
-    optimism: chex.Numeric | None = None,
-    current: bool | None = None,
-    alpha: chex.Numeric | None = None,
-    evaluated: float | None = None,
-    ratchet: bool = False,
-    elitism: bool | None = None,
+    key: chex.PRNGKey, objective: Objective, proposal: Proposal, **settings: Any
 ) -> CEResult:
     """Minimise ``objective`` by the cross-entropy method with a surrogate: `CEResult`. Algorithms 2
     to 4 of R. J. Moss's thesis.
@@ -133,7 +110,8 @@ def ce_surrogate(
         mode: "default" or "thesis".
         surrogate: the model: "gaussian process", "linear", "polynomial", or "radial basis" around
             the points that it is fitted to.
-        kernel: of the Gaussian process.
+        kernel: of the Gaussian process: "squared exponential", "matern12", "matern32" or
+            "matern52".
         degree: of the polynomial; 2 by default.
         basis: radial function of the distance r in the ``frame``: "gaussian", exp(-r^2 / 2 d);
             "linear", r; "squared", r^2; "multiquadratic", sqrt(r^2 + 1). Given alone, as in the
@@ -168,37 +146,11 @@ def ce_surrogate(
         >>> bool(found.best_value < 1.0)
         True
     """
-    return _run("ce_surrogate", **locals())
+    return _run("ce_surrogate", key=key, objective=objective, proposal=proposal, **settings)
 
 
 def ce_mixture(
-    key: chex.PRNGKey,
-    objective: Objective,
-    proposal: Proposal,
-    *,
-    samples: int = 10,
-    elites: int = 5,
-    iterations: int = 10,
-    schedule: Schedule | Sequence[int] | None = None,
-    mode: Literal["default", "thesis"] = "default",
-    surrogate: Surrogate | None = None,
-    kernel: Literal["squared exponential", "matern12", "matern32", "matern52"] | None = None,
-    degree: int | None = None,
-    basis: Literal["gaussian", "linear", "squared", "multiquadratic"] | None = None,
-    memory: int | None = None,
-    best: int | None = None,
-    warp: Literal["raw", "standard", "rank"] | None = None,
-    frame: Literal["window", "initial"] | None = None,
-    selection: float | Literal["elites", "dimension"] | None = None,
-    optimism: chex.Numeric | None = None,
-    current: bool | None = None,
-    alpha: chex.Numeric | None = None,
-    evaluated: float | None = None,
-    ratchet: bool = False,
-    elitism: bool | None = None,
-    components: int | None = None,
-    start: Literal["elites", "searches"] | None = None,
-    regularisation: chex.Numeric | None = None,
+    key: chex.PRNGKey, objective: Objective, proposal: Proposal, **settings: Any
 ) -> CEResult:
     """Minimise ``objective`` by the cross-entropy method with a surrogate and a mixture for its
     proposal: `CEResult`. Algorithm 5 of R. J. Moss's thesis.
@@ -228,15 +180,35 @@ def ce_mixture(
         >>> found.proposal.weights.shape
         (2,)
     """
-    return _run("ce_mixture", **locals())
+    return _run("ce_mixture", key=key, objective=objective, proposal=proposal, **settings)
 
 
-def _run(method: str, *, key: chex.PRNGKey, objective: Objective, **given: Any) -> CEResult:
+def _run(
+    method: str, *, key: chex.PRNGKey, objective: Objective, proposal: Proposal, **settings: Any
+) -> CEResult:
     check_random_key(method, key)
-    plan, settings, proposal = make_plan(method, **given)
+    plan, real, proposal = make_plan(method, proposal, **DEFAULTS | settings)
     mean = jax.tree.leaves(proposal)[-2]
     objective = check_objective(method, objective, mean.shape[-1], mean.dtype)
-    return iterate.run(plan, settings, key, objective, proposal)
+    return iterate.run(plan, real, key, objective, proposal)
+
+
+DEFAULTS = dict(ce_method.__kwdefaults__)
+
+
+def _signature(method: str) -> inspect.Signature:
+    """That of `ce_method` with the settings of ``method``, None where they are those of its
+    mode.
+    """
+    whole = inspect.signature(ce_method)
+    own = dict(whole.parameters)
+    for name in MODES[method]["default"]:
+        own.setdefault(name, inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=None))
+    return whole.replace(parameters=list(own.values()))
+
+
+ce_surrogate.__signature__ = _signature("ce_surrogate")
+ce_mixture.__signature__ = _signature("ce_mixture")
 
 
 @jax.tree_util.register_dataclass
@@ -268,12 +240,6 @@ def start(
     key: chex.PRNGKey,
     proposal: Proposal,
     method: Literal["ce_method", "ce_surrogate", "ce_mixture"] = "ce_surrogate",
-    *,
-    samples: int = 10,
-    elites: int = 5,
-    iterations: int = 10,
-    schedule: Schedule | Sequence[int] | None = None,
-    mode: Literal["default", "thesis"] = "default",
     **settings: Any,
 ) -> Search:
     """A `Search` for an objective that need not be written in JAX.
@@ -284,9 +250,9 @@ def start(
 
     Args:
         key: consumed.
-        proposal, samples, elites, iterations, schedule, mode: as for `ce_method`.
+        proposal: as for `ce_method`.
         method: the function whose steps it takes: "ce_method", "ce_surrogate" or "ce_mixture".
-        settings: the other keywords of that function, such as ``surrogate`` or ``components``.
+        settings: the keywords of that function, such as ``samples`` or ``components``.
 
     Raises:
         ValueError: for an unknown method or setting, and as the function does.
@@ -304,16 +270,7 @@ def start(
     if method not in list(MODES):
         raise ValueError(f"start: method must be one of {list(MODES)}, received {method!r}")
     check_random_key("start", key)
-    plan, real, proposal = make_plan(
-        method,
-        proposal,
-        samples=samples,
-        elites=elites,
-        iterations=iterations,
-        schedule=schedule,
-        mode=mode,
-        **settings,
-    )
+    plan, real, proposal = make_plan(method, proposal, **DEFAULTS | settings)
     return Search(iterate.begin(plan, key, proposal), real, plan)
 
 

@@ -16,7 +16,6 @@ from jast._src.cross_entropy import gaussian
 from jast._src.cross_entropy.gaussian import Gaussian
 from jast._src.runtime._jax import is_traced
 from jast._src.util import display
-from jast._src.util.checks import real_number, whole_number
 
 if TYPE_CHECKING:
     import chex
@@ -121,39 +120,17 @@ def em(
 
     With ``diagonal`` the components have diagonal covariances. No variance is below
     ``least_variance``.
-
-    Raises ValueError for shapes that do not fit, iterations that are no whole number of at least 0,
-    and a negative regularisation, least or least_variance (unless traced).
     """
-    k, d = m.means.shape if m.means.ndim == 2 else (None, None)
-    if m.weights.shape != (k,) or m.covariances.shape != (k, d, d):
-        received = [a.shape for a in m]
-        raise ValueError(
-            "mixture.em: weights must be [k], means [k, d] and covariances [k, d, d],"
-            f" received {received}"
-        )
-    if x.ndim != 2 or x.shape[1] != d or weights.shape != x.shape[:1]:
-        raise ValueError(
-            f"mixture.em: x must be [n, {d}] and its weights [n], received {x.shape} and"
-            f" {weights.shape}"
-        )
-    steps = whole_number("mixture.em", "iterations", iterations, 0)
-    numbers = dict(
-        regularisation=regularisation,
-        least=x.shape[1] if least is None else least,
-        least_variance=least_variance,
-    )
-    for name, value in numbers.items():
-        value = real_number("mixture.em", name, value, lambda v: v >= 0, "of at least 0")
-        numbers[name] = value.astype(x.dtype)
+    least = x.shape[1] if least is None else least
+    numbers = tuple(jnp.asarray(v).astype(x.dtype) for v in (regularisation, least, least_variance))
     weights = weights.astype(x.dtype)
     counted = weights > 0
     x, w = jnp.where(counted[:, None], x, 0), jnp.where(counted, weights, 0)
 
     def iterate(_, m):
-        return _em_iteration(m, x, w, diagonal, **numbers)
+        return _em_iteration(m, x, w, diagonal, *numbers)
 
-    return lax.fori_loop(0, steps, iterate, m)
+    return lax.fori_loop(0, iterations, iterate, m)
 
 
 def _em_iteration(m, x, w, diagonal, regularisation, least, least_variance):

@@ -15,8 +15,8 @@ from jax.flatten_util import ravel_pytree
 from jax.tree_util import Partial
 
 from jast import distributions as D
-from jast._src.core import actions as choices
 from jast._src.core import failures
+from jast._src.core.actions import Quantiles, UniformBox, quantiles
 from jast._src.core.check import contract
 from jast._src.core.episode import rollout
 from jast._src.core.rewards import LogLikelihood, as_pytree
@@ -144,15 +144,15 @@ def over(sim: Simulator, *, reward: Reward | None = None, actions: Actions | Non
         raise ValueError(
             f"over: reward must be a function, one of jast.rewards or yours, received {reward!r}"
         )
-    actions = choices.quantiles() if actions is None else actions
-    if not isinstance(actions, choices.Quantiles | choices.UniformBox):
+    actions = quantiles() if actions is None else actions
+    if not isinstance(actions, Quantiles | UniformBox):
         raise ValueError(
             "over: actions must be jast.actions.quantiles() or uniform(low, high), received"
             f" {actions!r}"
         )
     contract("over", sim)
     about = outline(sim)
-    box = isinstance(actions, choices.UniformBox)
+    box = isinstance(actions, UniformBox)
     for name, offer, other in (
         ("start", about.start, ""),
         ("disturbance", about.disturbance, "; give actions=jast.actions.uniform(low, high)"),
