@@ -160,8 +160,7 @@ def _learn(method, plan, kept, auto_scale, watch, store):
                 # in one statement: an interruption finds all of a chunk or nothing
                 kept = training, rows
                 if store is not None:
-                    leaves = enumerate(jax.tree.leaves(kept))
-                    store.replace({}, {str(i): np.asarray(a) for i, a in leaves})
+                    store.replace(jax.tree.leaves(kept))
                 failing, log_p = f"{last.failing_share:.1%}", f"{last.log_p:.4g}"
                 watch.reach(int(training.step) * lanes, failing=failing, log_p=log_p)
                 watch.tell(lambda rows=rows: history_of(rows[1:]))
@@ -180,5 +179,5 @@ def _resume(method, store):
         return None
     like = jax.eval_shape(method.begin)
     like = like if method.keeps_buffer else like._replace(buffer=())
-    *leaves, rows = (state[1][str(i)] for i in range(len(state[1])))
+    *leaves, rows = state
     return jax.tree.structure(like).unflatten(map(jnp.asarray, leaves)), rows

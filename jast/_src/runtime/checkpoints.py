@@ -29,7 +29,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jast._src.io import npz
+from jast._src.io import npz, save_load
 from jast._src.io.fingerprint import describe_differences, fingerprint
 
 if TYPE_CHECKING:
@@ -161,21 +161,20 @@ class Checkpoint:
         with self._writing():
             self._parts.put(f"{name}-{number}", header, b"".join(a.tobytes() for a in arrays))
 
-    def state(self) -> tuple[dict, dict[str, np.ndarray]] | None:
-        """``(header, arrays)`` of where a chain of steps stands; None where there is no whole
-        one.
-        """
+    def state(self) -> Any:
+        """Where a chain of steps stands; None where there is no whole one."""
         try:
-            return npz.read(self._state, {STATE: VERSION}, "the state of a checkpoint")
+            found = npz.read(self._state, {STATE: VERSION}, "the state of a checkpoint")
         except (FileNotFoundError, ValueError):  # not there, or damaged with the machine
             return None
+        return save_load.whole(self._state, *found)
 
-    def replace(self, header: dict, arrays: dict[str, np.ndarray]) -> None:
-        """Keep the next `state`. The write is atomic: the last one is replaced only once the new
-        one is complete. OSError where it cannot be written.
+    def replace(self, state: Any) -> None:
+        """Keep the next `state`, of which `jast.save` could make a file. The write is atomic: the
+        last one is replaced only once the new one is complete. OSError where it cannot be written.
         """
         with self._writing():
-            npz.write(self._state, STATE, VERSION, header, arrays, quick=True)
+            npz.write(self._state, STATE, VERSION, *save_load.parts(state), quick=True)
 
     def choose_once(self, choose: Callable[[], dict[str, Any]]) -> dict[str, Any]:
         """``choose()``, a dict that JSON can hold, as the first call chose: what depends on the

@@ -14,6 +14,8 @@ import numpy as np
 from jax import lax
 from jax.tree_util import Partial
 
+from jast._src.heads.networks import adam, adam_step
+
 __all__ = [
     "adversary",
     "autoencoder",
@@ -136,10 +138,7 @@ def _fit(key, params, data, apply, *, epochs, rate, loss, batch):
     """``epochs`` passes in minibatches over ``data`` (rows, targets, number, size), the first
     ``size`` of the rows' ``number``, by Adam that starts anew: (params, mean loss of each epoch).
     """
-    import optax  # here: it takes a while
-
     rows, targets, number, size = data
-    optimiser = optax.adam(rate)
     place = jnp.arange(len(number), dtype=jnp.int32)
     size = jnp.asarray(size, jnp.int32)
     steps = (size + batch - 1) // batch
@@ -154,9 +153,7 @@ def _fit(key, params, data, apply, *, epochs, rate, loss, batch):
         value, gradient = jax.value_and_grad(mean_loss)(
             params, order[jnp.minimum(now, size - 1)], weight
         )
-        with jax.numpy_dtype_promotion("standard"):  # optax asks for it
-            update, state = optimiser.update(gradient, state)
-            params = optax.apply_updates(params, update)
+        params, state = adam_step(params, state, gradient, rate)
         return params, state, total + value * jnp.sum(weight)
 
     def epoch(carry, key):
@@ -171,7 +168,7 @@ def _fit(key, params, data, apply, *, epochs, rate, loss, batch):
         return (params, state), total / size.astype(jnp.float32)
 
     (params, _), losses = lax.scan(
-        epoch, (params, optimiser.init(params)), jax.random.split(key, epochs)
+        epoch, (params, adam().init(params)), jax.random.split(key, epochs)
     )
     return params, losses
 

@@ -12,7 +12,6 @@ import jax
 import numpy as np
 
 from jast._src.core.counter_prng import numpy_generator
-from jast._src.io import save_load
 from jast._src.runtime.checkpoints import open_checkpoint
 from jast._src.runtime.progress_bar import Watch, terminable
 from jast._src.util.checks import check_random_key, whole_number
@@ -115,10 +114,7 @@ def validate(
     about = dict(predict=predict, data=fingerprint(data), selector=_described(chosen), state=state)
     with open_checkpoint("validate", checkpoint, key, **about) as store, terminable():
         kept = None if store is None else store.state()
-        if kept is not None:
-            state = save_load.whole(checkpoint, *kept)
-        elif state is None:
-            state = _begin(key, data, chosen)
+        state = kept or state or _begin(key, data, chosen)
         budget = max(budget, len(state.order))
         return _run(state, chosen, data, predict, budget, store, progress, callback)
 
@@ -205,7 +201,7 @@ def _run(state, selector, data, predict, budget, store, progress, callback):
 
     def keep():
         if store is not None:
-            store.replace(*save_load.parts(kept()))
+            store.replace(kept())
 
     current = seen
 
