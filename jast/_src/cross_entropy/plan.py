@@ -17,44 +17,32 @@ from jast._src.util.checks import real_number, whole_number
 
 __all__ = ["MODES", "check_objective", "make_plan"]
 
-_MODEL = dict(
-    surrogate="gaussian process",
-    kernel="squared exponential",
-    basis="gaussian",
-    degree=2,
-    alpha=1.0,
+PLAIN = dict(elitism=(False, True))
+SURROGATE = PLAIN | dict(
+    memory=(3, 3),
+    best=(0, 10),
+    evaluated=(0.0, 0.1),
+    current=(False, True),
+    warp=("raw", "rank"),
+    frame=("initial", "window"),
+    optimism=(0.0, 1.0),
+    selection=("elites", "dimension"),
+    surrogate=("gaussian process", "gaussian process"),
+    kernel=("squared exponential", "squared exponential"),
+    basis=("gaussian", "gaussian"),
+    degree=(2, 2),
+    alpha=(1.0, 1.0),
 )
-_THESIS = dict(
-    elitism=False,
-    memory=3,
-    best=0,
-    evaluated=0.0,
-    current=False,
-    warp="raw",
-    frame="initial",
-    optimism=0.0,
-    selection="elites",
-    **_MODEL,
+MIXTURE = SURROGATE | dict(
+    components=(None, 2), start=("searches", "elites"), regularisation=(0.0, 0.0)
 )
-_DEFAULT = dict(
-    elitism=True,
-    memory=3,
-    best=10,
-    evaluated=0.1,
-    current=True,
-    warp="rank",
-    frame="window",
-    optimism=1.0,
-    selection="dimension",
-    **_MODEL,
-)
+"""Setting -> (its value in mode "thesis", in mode "default")."""
 MODES = {
-    "ce_method": {"thesis": dict(elitism=False), "default": dict(elitism=True)},
-    "ce_surrogate": {"thesis": _THESIS, "default": _DEFAULT},
-    "ce_mixture": {
-        "thesis": dict(components=None, start="searches", regularisation=0.0, **_THESIS),
-        "default": dict(components=2, start="elites", regularisation=0.0, **_DEFAULT),
-    },
+    method: {
+        mode: {name: values[i] for name, values in table.items()}
+        for i, mode in enumerate(("thesis", "default"))
+    }
+    for method, table in dict(ce_method=PLAIN, ce_surrogate=SURROGATE, ce_mixture=MIXTURE).items()
 }
 """What each method does where the user does not say; no ``components``: as many as elites."""
 

@@ -78,32 +78,33 @@ class HeadSettings(NamedTuple):
     """
 
 
-CODE = HeadSettings(
-    round=1,
-    bins=10,
-    hidden=(64, 124, 64),
-    activation=("gelu", "relu"),
-    first_activation=False,
-    normalise=False,
-    loss="squared_shares",
-    learning_rate=(0.005, 0.001),
-    batch=(1, 1),
-    steps=(None, None),
-    replay=(0, 0),
-    elite=1.0,
-    episodes=False,
-    target="parent",
-    edges="all",
-    untrained_alone=True,
-    from_start=True,
-    power=2.0,
-    share=1.0,
-    q_weight=0.6,
-    v_weight=0.4,
-    candidates="all",
-    train=True,
+TABLE = dict(
+    round=(1, None),
+    bins=(10, 40),
+    hidden=((64, 124, 64), (32,)),
+    activation=(("gelu", "relu"), ("relu", "relu")),
+    first_activation=(False, True),
+    normalise=(False, True),
+    loss=("squared_shares", "cross_entropy"),
+    learning_rate=((0.005, 0.001), (0.01, 0.01)),
+    batch=((1, 1), (64, 128)),
+    steps=((None, None), (500, 200)),
+    replay=((0, 0), (4096, 65536)),
+    elite=(1.0, 0.25),
+    episodes=(False, True),
+    target=("parent", "own"),
+    edges=("all", "roots"),
+    untrained_alone=(True, False),
+    from_start=(True, False),
+    power=(2.0, 3.0),
+    share=(1.0, 1.0),
+    q_weight=(0.6, 0.5),
+    v_weight=(0.4, 0.5),
+    candidates=("all", "one"),
+    train=(True, True),
 )
-"""The published code of MCFS-AP."""
+"""Setting -> (its value in the published code of MCFS-AP, by default)."""
+CODE, DEFAULT = (HeadSettings(**{name: v[i] for name, v in TABLE.items()}) for i in range(2))
 TEXT = CODE._replace(
     first_activation=True,
     target="own",
@@ -112,37 +113,9 @@ TEXT = CODE._replace(
     power=1.0,
     q_weight=1.0,
 )
-"""Its text, section 3.3 and eq. 3; what the text leaves open is as in the code, c2 too."""
-MODES = {
-    "code": CODE,
-    "text": TEXT,
-    "paper": CODE,  # the earlier name of "code"
-    "default": HeadSettings(
-        round=None,
-        bins=40,
-        hidden=(32,),
-        activation=("relu", "relu"),
-        first_activation=True,
-        normalise=True,
-        loss="cross_entropy",
-        learning_rate=(0.01, 0.01),
-        batch=(64, 128),
-        steps=(500, 200),
-        replay=(4096, 65536),
-        elite=0.25,
-        episodes=True,
-        target="own",
-        edges="roots",
-        untrained_alone=False,
-        from_start=False,
-        power=3.0,
-        share=1.0,
-        q_weight=0.5,
-        v_weight=0.5,
-        candidates="one",
-        train=True,
-    ),
-}
+"""The text of MCFS-AP, section 3.3 and eq. 3; what it leaves open is as in the code, c2 too."""
+MODES = {"default": DEFAULT, "code": CODE, "text": TEXT, "paper": CODE}
+""""paper" is the earlier name of "code"."""
 
 
 def _whole(value: Any, least: int) -> bool:
