@@ -16,6 +16,7 @@ from jast._src.core.signature import outline
 from jast._src.core.simulator import Simulator
 from jast._src.distributions.flat_rows import flat, unflat
 from jast._src.heads.heads import Heads, observation, policy_logits, sample_bins
+from jast._src.heads.samples import cells
 
 if TYPE_CHECKING:
     import chex
@@ -57,11 +58,7 @@ class Histogram(D.Distribution):
     def log_prob(self, value):
         """Log density; floating disturbances only, since a cell need not hold whole integers."""
         bins = self._logits.shape[1]
-        cell = jnp.clip(
-            jnp.floor(flat(self._actions.locate(value, self._dist)) * bins).astype(jnp.int32),
-            0,
-            bins - 1,
-        )
+        cell = cells(flat(self._actions.locate(value, self._dist)), bins)
         logs = jnp.take_along_axis(
             jax.nn.log_softmax(self._logits, axis=1), cell[:, None], axis=1
         ) + jnp.log(jnp.float32(bins))

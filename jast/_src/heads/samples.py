@@ -14,6 +14,7 @@ from jast._src.heads.heads import observation
 
 __all__ = [
     "Samples",
+    "cells",
     "join_samples",
     "samples_of_edges",
     "samples_of_episodes",
@@ -95,7 +96,7 @@ def _episode_rows(sim, actions, episodes, bins):
 
         def step(state, x):
             u = flat(actions.locate(x, sim.disturbance(state)))
-            return observation(sim, state), jax.nn.one_hot(_cells(u, bins), bins, dtype=jnp.float32)
+            return observation(sim, state), jax.nn.one_hot(cells(u, bins), bins, dtype=jnp.float32)
 
         rows = jax.vmap(step)(jax.tree.map(lambda a: a[:-1], states), episode.disturbances)
         return *rows, jnp.arange(sim.horizon, dtype=jnp.int32) < episode.length
@@ -103,7 +104,7 @@ def _episode_rows(sim, actions, episodes, bins):
     return jax.vmap(one)(episodes)
 
 
-def _cells(u, bins):
+def cells(u, bins):
     """The cell of each point of the unit interval."""
     return jnp.clip(jnp.floor(u * bins).astype(jnp.int32), 0, bins - 1)
 
@@ -117,7 +118,7 @@ def _root_rows(sim, actions, roots, bins):
         u = jax.vmap(lambda x: flat(actions.locate(x, dist)))(xs)  # [K, d]
         n = visits.astype(jnp.float32)
         shares = jnp.einsum(
-            "k,kdb->db", n, jax.nn.one_hot(_cells(u, bins), bins, dtype=jnp.float32)
+            "k,kdb->db", n, jax.nn.one_hot(cells(u, bins), bins, dtype=jnp.float32)
         ) / jnp.maximum(jnp.sum(n), 1)
         return observation(sim, state), jax.vmap(flat)(xs), shares
 

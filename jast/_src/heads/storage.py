@@ -52,8 +52,7 @@ def parts(heads: Heads) -> dict[str, Any]:
                 f"save: the {name} head must be a pair (params, apply), received"
                 f" {type(head).__name__}"
             )
-        known = head and dict(network=_specification(head), params=head.params)
-        fields[name] = known
+        fields[name] = head and dict(network=_specification(head), params=head.params)
     return fields
 
 

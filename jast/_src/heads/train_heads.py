@@ -31,7 +31,7 @@ from jast._src.heads.samples import (
 )
 from jast._src.heads.train_head import HeadState, init_head, train_head
 from jast._src.runtime._jax import is_traced
-from jast._src.util.pytrees import count_numbers
+from jast._src.util.pytrees import count_numbers, shapes_text
 
 __all__ = ["HeadTraining", "init_heads", "train_heads", "with_moments"]
 
@@ -143,8 +143,7 @@ def _check_outputs(heads, n, d):
         )
         if not fits or not jnp.issubdtype(out.dtype, jnp.floating):
             raise ValueError(
-                f"heads: the {name} head returned"
-                f" {jax.tree.map(lambda s: f'{s.dtype}{list(s.shape)}', out)}, expected {wanted}"
+                f"heads: the {name} head returned {shapes_text(out)}, expected {wanted}"
             )
 
 

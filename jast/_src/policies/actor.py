@@ -3,7 +3,6 @@ whatever the units and the family of p. It gives a mixture of normal distributio
 observed of a state.
 """
 
-import itertools
 import math
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
@@ -16,6 +15,7 @@ from jax.scipy.special import ndtr
 from jast import distributions as D
 from jast._src.core.signature import ask, outline
 from jast._src.core.simulator import Simulator
+from jast._src.distributions.flat_rows import split
 from jast._src.heads.heads import Moments
 from jast._src.heads.networks import dense
 from jast._src.util.pytrees import count_numbers
@@ -103,18 +103,10 @@ def init_parameters(key: jax.Array, shapes: Sequence[Any]) -> list[Any]:
         return dict.fromkeys(layer, layer["kernel"].shape[0])
 
     networks = [params["params"] for params in shapes]
-    leaves, structure = jax.tree.flatten(networks)
-    fans = jax.tree.leaves(
-        [{name: fan_in(layer) for name, layer in network.items()} for network in networks]
-    )
-    sizes = [math.prod(s.shape) for s in leaves]
-    ends = list(itertools.accumulate(sizes))
-    flat = jax.random.uniform(key, (ends[-1],), jnp.float32, -1, 1)
-    drawn = [
-        flat[end - size : end].reshape(s.shape) / math.sqrt(fan)
-        for s, fan, size, end in zip(leaves, fans, sizes, ends, strict=True)
-    ]
-    return [{"params": params} for params in structure.unflatten(drawn)]
+    fans = [{name: fan_in(layer) for name, layer in network.items()} for network in networks]
+    drawn = jax.random.uniform(key, (count_numbers(networks),), jnp.float32, -1, 1)
+    scaled = jax.tree.map(lambda a, fan: a / math.sqrt(fan), split(drawn, networks), fans)
+    return [{"params": params} for params in scaled]
 
 
 def network_inputs(

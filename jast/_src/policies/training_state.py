@@ -3,8 +3,6 @@ learner takes from the exploration before it learns.
 """
 
 import functools
-import itertools
-import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -13,6 +11,7 @@ import jax.numpy as jnp
 from jax import lax
 
 from jast._src.core.simulator import Simulator
+from jast._src.distributions.flat_rows import split
 from jast._src.distributions.mixtures import x_of
 from jast._src.heads.heads import Moments
 from jast._src.policies.actor import Normalisation, latent_mixture, network_inputs, sample_latents
@@ -26,7 +25,7 @@ from jast._src.policies.lanes import (
     step_lane,
 )
 from jast._src.policies.start_fit import Tilt, fit_tilt
-from jast._src.util.pytrees import select
+from jast._src.util.pytrees import count_numbers, select
 
 __all__ = [
     "Config",
@@ -261,9 +260,8 @@ def _normals(key: jax.Array, *shapes: tuple[int, ...]) -> list[jax.Array]:
     """Standard normal arrays of these shapes, by one call of the generator: each takes long to
     compile.
     """
-    ends = list(itertools.accumulate(map(math.prod, shapes)))
-    flat = jax.random.normal(key, (ends[-1],), jnp.float32)
-    return [flat[end - math.prod(s) : end].reshape(s) for s, end in zip(shapes, ends, strict=True)]
+    like = [jax.ShapeDtypeStruct(s, jnp.float32) for s in shapes]
+    return split(jax.random.normal(key, (count_numbers(like),), jnp.float32), like)
 
 
 @jax.jit
