@@ -248,6 +248,10 @@ def test_save_refuses_what_no_file_can_hold(tmp_path):
     for heads, reason in (
         (Heads("rollout"), r"save: the policy head must be a pair \(params, apply\), received str"),
         (
+            Heads(head, levels=2.5),
+            "save: levels must be a whole number of at least 0, received 2.5",
+        ),
+        (
             Heads((np.array([None]), linear)),
             "save: result.policy.params must be an array of numbers, received object",
         ),

@@ -14,6 +14,7 @@ from jast._src.heads.heads import Heads
 from jast._src.heads.networks import ACTIVATIONS, Head, dense
 from jast._src.io import save_load
 from jast._src.io.codec import Given, check_fits
+from jast._src.util.checks import whole_number
 
 if TYPE_CHECKING:
     from jast._src.core.typing import PathLike
@@ -44,7 +45,8 @@ def load(path: PathLike, heads: Heads | None = None) -> Heads:
 
 def parts(heads: Heads) -> dict[str, Any]:
     """The fields of heads as a file has them: a head as its parameters and its network."""
-    fields = {name: getattr(heads, name) for name in ("inputs", "returns", "levels")}
+    levels = whole_number("save", "levels", heads.levels, 0)
+    fields = dict(inputs=heads.inputs, returns=heads.returns, levels=levels)
     for name in HEADS:
         head = getattr(heads, name)
         if head is not None and not isinstance(head, Head):
