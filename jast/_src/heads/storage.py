@@ -72,8 +72,8 @@ def whole(path: Any, fields: dict[str, Any], given: Given) -> Heads:
 
 
 def _specification(head):
-    """What `make_head` needs to make this network again; None for a function of
-    another kind, or parameters that are not its own.
+    """What `make_head` needs to make this network again; None for a function of another kind, or
+    parameters that are not its own.
     """
     module = getattr(getattr(head.apply, "func", None), "__self__", None)
     if (
