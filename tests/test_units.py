@@ -447,14 +447,14 @@ def test_a_state_that_cannot_be_written_leaves_the_last_one(key, tmp_path, monke
         raise OSError(28, "No space left on device")
 
     with open_checkpoint("sac", tmp_path, key) as store:
-        store.replace({"at": 1}, {"a": np.arange(3)})
+        store.replace({"at": 1, "a": np.arange(3)})
         with monkeypatch.context() as patch:
             patch.setattr(np, "savez", full)
             with pytest.raises(OSError, match="sac: checkpoint .* No space left"):
-                store.replace({"at": 2}, {"a": np.arange(4)})
+                store.replace({"at": 2, "a": np.arange(4)})
     with open_checkpoint("sac", tmp_path, key) as store:
-        header, arrays = store.state()
-        assert header["at"] == 1 and arrays["a"].tolist() == [0, 1, 2]
+        state = store.state()
+        assert state["at"] == 1 and state["a"].tolist() == [0, 1, 2]
         (tmp_path / "state.jast").write_bytes(b"PK damaged")
         assert store.state() is None  # the chain begins anew
 
