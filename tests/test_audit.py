@@ -2,16 +2,20 @@
 
 from types import SimpleNamespace
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from test_failure_probability import FAR, planes
 
+import jast
+from jast import distributions as D
 from jast._src.estimate.gaussians.family import GaussianFamily, Points
 from jast._src.estimate.gaussians.mixture_fit import as_latent, unit_gaussians
 from jast._src.estimate.proposal_search import audit
 from jast._src.estimate.proposal_search.audit import Missing, audit_proposal, uncovered
 from jast._src.estimate.proposal_search.search_state import SearchState, add_batch, search_context
 from jast._src.estimate.proposal_search.settings import SETTINGS
+from jast._src.estimate.tilts.family import TiltFamily
 
 BUDGET = 500_000  # a batch is 20,000 episodes
 
@@ -101,6 +105,37 @@ def test_failures_of_wide_noise_that_are_not_covered_name_no_share(key, monkeypa
         cooled = lambda f, state, n=n: (state, at(-2.0, n))
         monkeypatch.setattr(audit, "_equilibrate_cooled", cooled)
         assert audit_proposal(f, state).reasons == reasons
+
+
+def test_two_parts_that_are_missing_get_a_tilt_each(key):
+    """A sum of three numbers a step that fails upwards in any of them, and tilts that know one of
+    these modes: the others are both taken in at once, and one that is found twice only once.
+    """
+    failed = lambda s: jnp.max(s) - 8.0
+    sim = jast.Simulator(
+        init=lambda none: jnp.zeros(3),
+        step=lambda s, x: s + x,
+        disturbance=lambda s: D.Independent(D.Normal(jnp.zeros(3), 1.0), 1),
+        evaluate=lambda s: (failed(s) > 0, jnp.maximum(-failed(s), 0.0)),
+        horizon=4,
+    )
+    f, rng = TiltFamily(sim, 20_000, search_context(key)), np.random.default_rng(0)
+
+    def failures(mode):
+        z = rng.standard_normal((200, 4, 3))
+        z[:, :, mode] += 2.2
+        failing, points = f.play_again(z.reshape(200, 12))
+        return f.select(points, failing)
+
+    known, *lost = (failures(mode) for mode in range(3))
+    q = f.fit(known, np.zeros(len(known.length)))
+    state = add_batch(f, SearchState(), f.draw(q))
+    part = lambda after: max(uncovered(f, after, points).mean() for points in lost)
+    assert part(state) > 0.9
+    both = audit._absorb(f, state, [Missing(1.0, points) for points in lost])
+    assert part(both) < 0.05 and len(both.q.tilts) == 7
+    twice = audit._absorb(f, state, [Missing(1.0, lost[0]), Missing(float("nan"), lost[0])])
+    assert len(twice.q.tilts) <= 7 and not uncovered(f, twice, lost[0]).any()
 
 
 def test_a_budget_too_small_for_an_audit_is_said(key):

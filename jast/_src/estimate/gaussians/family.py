@@ -7,6 +7,7 @@ for each mode, or Gaussians that differ from the model in a few numbers.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -128,12 +129,15 @@ class GaussianFamily(NamedTuple):
         """
         return None if threshold == math.inf else (q, threshold)
 
-    def absorb(self, state: SearchState, points: Points, share: float) -> SearchState:
-        """The proposal with a mixture fitted to ``points``, whose probability is ``share`` times
-        what it found.
+    def absorb(self, state: SearchState, found: Sequence[tuple[Points, float]]) -> SearchState:
+        """The proposal with a mixture fitted to the points of each of ``found``, whose probability
+        is a share, as great, times what it found.
         """
-        g, least = self.of_population(points), self.settings.absorbed_share_least
-        return self.add(state, g, min(max(share / (1 + share), least), 1 - least))
+        least = self.settings.absorbed_share_least
+        for points, share in found:
+            part = min(max(share / (1 + share), least), 1 - least)
+            state = self.add(state, self.of_population(points), part)
+        return state
 
     def add(self, state: SearchState, g: Gaussians, share: float | None) -> SearchState:
         """The proposal with the `Gaussians` ``g`` for ``share`` of it; None: in place of it."""

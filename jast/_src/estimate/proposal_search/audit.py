@@ -51,11 +51,23 @@ def audit_proposal(family: Family, state: SearchState) -> SearchState:
             break
         if not left or state.spent + LEAST_BATCHES * family.batch > end:
             return _check_given(family, _report(state, missing))
-        for m in missing:
-            share = settings.absorbed_share_least if math.isnan(m.share) else m.share
-            state = family.absorb(state, m.points, share)
+        state = _absorb(family, state, missing)
         state = adapt_proposal(family, state, settings.audit_refits, end)
     return _check_given(family, _check_uncovered_share(family, state))
+
+
+def _absorb(family, state, missing):
+    """The state whose proposal takes in all of ``missing``: of each the part that those before it
+    do not cover, as one lost mode may have been found twice.
+    """
+    found, least = [], family.settings.absorbed_share_least
+    after = state
+    for m in missing:
+        if (rows := uncovered(family, after, m.points)).any():
+            share = least if math.isnan(m.share) else m.share
+            found.append((family.select(m.points, rows), share))
+            after = family.absorb(state, found)
+    return after
 
 
 def uncovered(family: Family, state: SearchState, points: Any) -> np.ndarray:

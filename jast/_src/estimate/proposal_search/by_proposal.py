@@ -177,7 +177,7 @@ def _search_tilts(request, context, state):
         near = _adapt_near(fitting, state._replace(q=q))
         if is_efficient(near, settings.family_efficiency):
             end = near.spent + settings.given_share * request.budget
-            return Search(*absorb_given(fitting, near, end))
+            return Search(fitting, absorb_given(fitting, near, end))
         state = near.for_next_family()._replace(given=state.given)
         if not _has_many_steps(request):
             return Search(f, state)
@@ -206,7 +206,8 @@ def _descend_to_tilts(f, request, state, room):
             last = before + settings.components_share * request.budget
             state = adapt_proposal(f, state, settings.refits, last)
             end += state.spent - before
-    return Search(*absorb_given(f, state, end + settings.given_share * request.budget))
+    end += settings.given_share * request.budget
+    return Search(f, absorb_given(f, state, end))
 
 
 def _adapt_near(f, state):

@@ -151,9 +151,9 @@ class Family(Protocol):
     def refit(self, state: SearchState) -> dict[str, Any]:
         """Proposals that are fitted to the failures of all batches, by what they are called."""
 
-    def absorb(self, state: SearchState, points: Any, share: float) -> SearchState:
-        """The proposal with a component for ``points``, whose probability is ``share`` times what
-        it found.
+    def absorb(self, state: SearchState, found: Sequence[tuple[Any, float]]) -> SearchState:
+        """The proposal with components for each (points, share) of ``found``, whose probability is
+        ``share`` times what it found.
         """
 
     def as_points(

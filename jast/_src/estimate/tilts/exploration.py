@@ -116,21 +116,21 @@ def replay_given(f: TiltFamily, state: SearchState, failures: Failures | None) -
     return state._replace(given=found) if len(found.z) else state
 
 
-def absorb_given(f: TiltFamily, state: SearchState, end: float) -> tuple[TiltFamily, SearchState]:
-    """The search after it absorbed the failures that came with the call, until ``end`` evaluations
+def absorb_given(f: TiltFamily, state: SearchState, end: float) -> SearchState:
+    """The state after it absorbed the failures that came with the call, until ``end`` evaluations
     are spent; where it found none, it begins anew from the likeliest of them.
     """
     s = f.settings
     if state.given is None:
-        return f, state
+        return state
     if state.q is None:
         state, found = _equilibrate(f, state, distinct(state.given.z, 1), s.chains_least)
         q = f.fit(found.points, np.zeros(len(found.z)))
         state = adapt_proposal(f, state._replace(q=q), s.refits, end)
         if state.log_mean == -math.inf:
-            return f, state._replace(q=None)
+            return state._replace(q=None)
     if not (rows := uncovered(f, state, state.given.points)).any():
-        return f, state
+        return state
     state, found = _equilibrate(f, state, distinct(state.given.z[rows], _chains(f)))
     state, done = state._replace(given=found), []
     for _ in range(s.given_tilts):
@@ -140,10 +140,9 @@ def absorb_given(f: TiltFamily, state: SearchState, end: float) -> tuple[TiltFam
         done.append(rows[0])
         state = state.note(f"failures given: {len(rows)} of {len(state.given.z)} not covered")
         state, lead = _equilibrate(f, state, state.given.z[rows[:1]], s.chains_least)
-        f = f._replace(widest=f.widest + 2)
-        state = f.absorb(state, lead.points, 1.0)
+        state = f.absorb(state, [(lead.points, 1.0)])
         state = adapt_proposal(f, state, s.audit_refits, end)
-    return f, state
+    return state
 
 
 def _equilibrate(f, state, z, chains=1):

@@ -7,6 +7,7 @@ their halves, so that no weight is without variance.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -93,8 +94,6 @@ class TiltFamily(NamedTuple):
     settings: SearchSettings = SETTINGS
     components_each: int = 1
     """Gaussians in the mixture that a normal number is drawn from"""
-    widest: int = COMPONENTS[1]
-    """Components, from which on no tilt is added"""
     name: str = "tilts"
 
     @property
@@ -182,20 +181,22 @@ class TiltFamily(NamedTuple):
         points = _join(*(b.points for b in state.batches))
         return {"refitted": self.fit(points, state.log_weight, self.groups(state.q, points))}
 
-    def absorb(self, state: SearchState, points: Points, share: float) -> SearchState:
-        """The proposal with a tilt of their own for ``points``, whose probability is ``share``
-        times what it found.
+    def absorb(self, state: SearchState, found: Sequence[tuple[Points, float]]) -> SearchState:
+        """The proposal with tilts of their own for the points of each of ``found``, whose
+        probability is a share, as great, times what it found; as many as there is room for.
         """
-        if len(state.q.tilts) >= self.widest:
-            return state
-        n, before = len(points.length), _join(*(b.points for b in state.batches))
+        found = found[: (COMPONENTS[-1] - len(state.q.tilts)) // 2]
+        points = _join(*(b.points for b in state.batches))
         log_w = state.log_weight - np.logaddexp.reduce(state.log_weight)
-        groups = self.groups(state.q, before)
-        groups = np.ones((len(log_w), 1)) if groups is None else groups
-        own = np.repeat([[0.0], [1.0]], [len(log_w), n], axis=0)
-        of = np.concatenate([np.pad(groups, ((0, n), (0, 0))), own], axis=1)
-        log_w = np.concatenate([log_w, np.full(n, math.log(share / n))])
-        return state._replace(q=self.fit(_join(before, points), log_w, of))
+        of = self.groups(state.q, points)
+        of = np.ones((len(log_w), 1)) if of is None else of
+        for more, share in found:
+            n = len(more.length)
+            own = np.repeat([[0.0], [1.0]], [len(log_w), n], axis=0)
+            of = np.concatenate([np.pad(of, ((0, n), (0, 0))), own], axis=1)
+            log_w = np.concatenate([log_w, np.full(n, math.log(share / n))])
+            points = _join(points, more)
+        return state._replace(q=self.fit(points, log_w, of)) if found else state
 
     def groups(self, q: Mixture, points: Points) -> np.ndarray | None:
         """Which part [m, M] of each of the ``points`` belongs to each group of the tilts of ``q``;
