@@ -6,7 +6,8 @@ probability: the closed loops of `benchmarks.closed_loops` and rows of static pr
 diffusions. Beside them stand plain draws for the CPU time of the first (what they would come to, by
 the measured rate of `jast.estimate.monte_carlo`) and OpenTURNS's subset simulation where it is
 installed. ``first`` is the first call in this process, with compilation. A silent miss is an
-unflagged answer more than 4 standard errors off, of itself and the truth.
+unflagged answer more than 4 standard errors off, of itself and the truth. An interval holds the
+truth where they are no further apart than it and the truth's own interval reach together.
 """
 
 import math
@@ -188,16 +189,20 @@ def row_of(name: str, about: System, method: str, seeds: int) -> dict[str, Any]:
         seconds.append(spent)
     if method == "subset":
         logs, errors = np.array(found).T
-        reliable, holds, evaluations = np.isfinite(logs), np.zeros(seeds, bool), 0
+        reliable, evaluations = np.isfinite(logs), 0
+        ends = np.full((seeds, 2), np.nan)
     else:
         logs = np.array([p.log_mean for p in found])
         errors = np.array([p.relative_error for p in found])
         reliable = np.array([p.reliable for p in found])
-        holds = np.array([p.interval[0] <= about.truth <= p.interval[1] for p in found])
+        ends = np.log(np.maximum([p.interval for p in found], 1e-300)) - math.log(about.truth)
         evaluations = int(np.mean([p.evaluations for p in found]))
     off = logs - math.log(about.truth)
     z = np.abs(off) / np.hypot(errors, about.error)
     known = reliable & np.isfinite(off)
+    # to either side, as far as the interval and that of the truth itself, of 95 % both
+    reach = np.hypot(ends - off[:, None], 1.96 * about.error)
+    holds = (off <= reach[:, 0]) & (-off <= reach[:, 1])
 
     def rms(a):
         return float(np.sqrt(np.mean(a**2))) if a.size else None

@@ -23,6 +23,7 @@ __all__ = [
     "flag_imprecise",
     "guaranteed_words",
     "is_doubtful",
+    "times_too_few",
 ]
 
 MAX_INVALID_SHARE = 0.01
@@ -31,6 +32,8 @@ MIN_COUNTED_FAILURES = 10
 """Failures from which on a count is believed: its relative standard error is then below a third."""
 MAX_RELATIVE_ERROR = 0.05
 """Relative standard error above which 10 % more or less lies within a 95 % interval."""
+IMPRECISE = "relative standard error"
+"""What the warning of one above that begins with."""
 MAX_LISTED_MODES = 12
 """Modes that are printed: a line of the screen."""
 
@@ -206,13 +209,21 @@ def is_doubtful(p: Estimate) -> bool:
     return guaranteed_words(p) is not None and p.chernoff is None and not math.isnan(p.log_mean)
 
 
+def times_too_few(found: Estimate) -> float:
+    """How many times as many evaluations make an `Estimate` reliable that is UNRELIABLE by its
+    standard error alone; 1 for every other one.
+    """
+    imprecise = not found.reliable and "".join(found.warnings[:1]).startswith(IMPRECISE)
+    return (found.relative_error / MAX_RELATIVE_ERROR) ** 2 if imprecise else 1.0
+
+
 def flag_imprecise(found: Estimate) -> Estimate:
     """The `Estimate` that is UNRELIABLE where nothing is wrong with it but its standard error."""
     if not (found.reliable and found.relative_error > MAX_RELATIVE_ERROR):
         return found
     enough = found.episodes * (found.relative_error / MAX_RELATIVE_ERROR) ** 2
     text = (
-        f"relative standard error {found.relative_error:.2g}, above {MAX_RELATIVE_ERROR}: the"
+        f"{IMPRECISE} {found.relative_error:.2g}, above {MAX_RELATIVE_ERROR}: the"
         f" interval is too wide for an answer, and some {enough:.1g} evaluations would narrow it to"
         " that"
     )

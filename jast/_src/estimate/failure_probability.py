@@ -5,6 +5,7 @@ methods beside it.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from typing import TYPE_CHECKING
 
 import jax
@@ -15,6 +16,7 @@ from jast._src.estimate.few_calls import few_calls
 from jast._src.estimate.importance_sampling import importance
 from jast._src.estimate.multilevel import failure_proposal
 from jast._src.estimate.population.failure_sample import Sample
+from jast._src.estimate.population.population import MIN_BUDGET as POPULATIONS_LEAST
 from jast._src.estimate.population.population import by_populations
 from jast._src.estimate.proposal_search.by_proposal import Request, estimate_by_proposal
 from jast._src.estimate.redraw import is_proposal_of
@@ -22,6 +24,7 @@ from jast._src.normal_space import transform
 from jast._src.runtime import work
 from jast._src.runtime._jax import briefly
 from jast._src.runtime.checkpoints import keep_answers, open_checkpoint
+from jast._src.runtime.host_errors import runs_on_host
 from jast._src.util.checks import check_random_key, whole_number
 from jast._src.util.display import call_settings
 from jast._src.util.intervals import checked_level
@@ -106,7 +109,9 @@ def failure_probability(
         key: consumed.
         sim: the simulator; its disturbances have quantile functions.
         budget: episodes to simulate, at least 50. Default: what a cheap system simulates in some
-            eight CPU seconds, at most 33,554,432; 100,000 of others.
+            eight CPU seconds, at most 33,554,432; 100,000 of others. Where only the standard error
+            of that answer makes it UNRELIABLE, and 4,194,304 would do, it is made again with these
+            (but not with a ``checkpoint``).
         seconds: in place of ``budget``: as many episodes as the system simulates in so many CPU
             seconds (a black box: seconds), rounded down to 2^k or 3 2^k. Compilation and the
             method's own work come on top.
@@ -159,6 +164,7 @@ def failure_probability(
     if near is not None and is_proposal_of(sim, near.proposal):
         similar = None if isinstance(near.proposal, Sample) else near.proposal  # it draws nothing
     guided = failures is not None or similar is not None
+    by_default = budget is None and seconds is None and not guided and checkpoint is None
     if budget is None:
         budget = budgets.DEFAULT_BUDGET
         if not guided or seconds is not None:
@@ -179,6 +185,9 @@ def failure_probability(
         elif budget < MIN_BUDGET:
             found = few_calls.few_calls(key, sim, budget, level, known, progress, callback)
         else:
+            # tilts may have spent half, and populations know nothing of failures given
+            serve = not (guided or runs_on_host(sim)) and budget >= 2 * POPULATIONS_LEAST
+            about = dict(level=level, watched=watched, ways=ways)
             wanted = Request(
                 name=name,
                 key=key,
@@ -191,8 +200,21 @@ def failure_probability(
                 level=level,
                 watched=watched,
                 ways=ways,
+                otherwise=partial(by_populations, name, key, sim, **about) if serve else None,
             )
             found = flag_imprecise(estimate_by_proposal(wanted))
+    more = budgets.next_budget(found, budget) if by_default and not few else None
+    if more is not None:
+        again = failure_probability(
+            *(key, sim, more),
+            level=level,
+            progress=progress,
+            callback=callback,
+            executor=executor,
+            devices=devices,
+        )
+        said = f"{found.evaluations} evaluations were too few: {found.relative_error:.1%}"
+        return again._replace(history=(said, *again.history))
     return found._replace(settings=settings)
 
 

@@ -146,7 +146,9 @@ def stress(
         sim: the simulator.
         budget: evaluations (episodes; one with its gradient counts as 3 or 4) in all, nearly; at
             least 300. Default: what a cheap system simulates in some eight CPU seconds, at most
-            33,554,432; 200,000 of others. The report's ``settings`` name the one that was used.
+            33,554,432; 200,000 of others. Where only the standard error of the probability makes it
+            UNRELIABLE, and 4,194,304 would do, everything is done again with these (but not with a
+            ``checkpoint``). The report's ``settings`` name the one that was used.
             Below 10,417 the probability is a surrogate's (`failure_probability` with few calls),
             and with more than 20 numbers an episode that of the plain draws alone.
         seconds: in place of ``budget``: as many evaluations as the system simulates in so many CPU
@@ -183,6 +185,7 @@ def stress(
     top = checks.whole_number(name, "top", top, 1)
     require_simulator(name, sim)
     check(sim)
+    by_default = budget is None and seconds is None and checkpoint is None
     if budget is None and seconds is None and not has_quantiles(sim):
         budget = DEFAULT_BUDGET
     if budget is None:
@@ -209,7 +212,13 @@ def stress(
             if test.nominal is None:
                 raise
             settings["interrupted"] = f"after {test.spent} of {budget} evaluations"
-    return test.report(settings)
+    report = test.report(settings)
+    if by_default and test.cheap and "interrupted" not in settings:
+        more = budgets.next_budget(report.probability, budget)
+        if more is not None:
+            places = dict(executor=executor, devices=devices)
+            return stress(key, sim, more, top=top, progress=progress, callback=callback, **places)
+    return report
 
 
 class _StressTest:

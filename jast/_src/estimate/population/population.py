@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from jast._src.core.simulator import Simulator
     from jast._src.core.typing import Callback, Executor, PathLike
 
-__all__ = ["by_populations", "episodes_a_second", "population"]
+__all__ = ["MIN_BUDGET", "by_populations", "episodes_a_second", "population"]
 
 MIN_BUDGET = 20_000
 """Evaluations of a call at least: a population of 128 points meets 1e-6 within them."""

@@ -199,7 +199,7 @@ class PopulationSearch:
         count = max(math.ceil(points / most), 1)
         n = int(points / count) // LANES * LANES
         if n >= min(MIN_POINTS, self.n) and not self.interrupted:
-            self.run(kind, count, n)
+            self.run(kind, int(points) // n, n)  # what whole blocks of lanes leave is one more
 
 
 def _run_population(shared, number, post):
