@@ -546,6 +546,16 @@ def test_stress_of_a_rare_failure(key, small):
     assert [m.share for m in report.modes] == [1.0]
 
 
+def test_a_default_stress_is_made_again_where_a_known_budget_would_do(key, small, monkeypatch):
+    monkeypatch.setattr(budgets, "measure_budget", lambda *args: 50_000)
+    more = lambda found, budget: 60_000 if budget == 50_000 else None
+    monkeypatch.setattr(budgets, "next_budget", more)
+    sim = limit_state(lambda u: 1.0 - u[0], 2)
+    report, again = jast.stress(key, sim), jast.stress(key, sim, 60_000)
+    assert report.settings["budget"] == 60_000
+    assert report.probability.interval == again.probability.interval
+
+
 @pytest.mark.long
 @pytest.mark.parametrize(
     "sim, truth", [(SIDES, 2 * norm.sf(3)), (HALF, norm.sf(3)), (SPHERE, stats.chi2(5).sf(25))]

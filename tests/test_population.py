@@ -15,6 +15,8 @@ import jast
 from jast import distributions as D
 from jast._src.core.counter_prng import counter_key
 from jast._src.estimate import budgets
+from jast._src.estimate import failure_probability as module
+from jast._src.estimate.estimate import flag_imprecise
 from jast._src.estimate.population import answer
 from jast._src.estimate.population import descents as ways
 from jast._src.estimate.population.failure_sample import Sample
@@ -394,6 +396,30 @@ def test_a_cheap_system_is_answered_by_populations_and_names_its_budget(key, mon
     monkeypatch.setattr(budgets, "episodes_a_second", lambda key, sim: 100.0)
     assert budgets.measure_budget("f", key, SIDES, None, 50) == budgets.DEFAULT_BUDGET
     assert budgets.measure_budget("f", key, SIDES, 20.0, 50) == 1536
+
+
+@pytest.mark.parametrize(
+    "error, given, budgets_used",
+    [(0.07, None, [3 * 2**17, 2**22]), (0.2, None, [3 * 2**17]), (0.07, 400_000, [400_000])],
+)
+def test_a_default_call_is_made_again_where_a_known_budget_would_do(
+    error, given, budgets_used, two, key, monkeypatch
+):
+    """A first error of 7 % needs twice as much, which is below 2^22; one of 20 % needs 16 times as
+    much, and what was asked for is not changed.
+    """
+    called = []
+
+    def answer_with(name, key, sim, budget, **how):
+        called.append(budget)
+        relative = error * (called[0] / budget) ** 0.5
+        return flag_imprecise(two._replace(relative_error=relative, reliable=True, warnings=()))
+
+    monkeypatch.setattr(budgets, "episodes_a_second", lambda key, sim: 5e4)
+    monkeypatch.setattr(module, "by_populations", answer_with)
+    found = failure_probability(key, SIDES, given)
+    assert called == budgets_used and found.settings["budget"] == called[-1]
+    assert found.reliable == (len(called) == 2)
 
 
 def test_seconds_of_a_black_box_are_of_the_clock(key):

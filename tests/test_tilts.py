@@ -18,6 +18,7 @@ from benchmarks.markov_systems import CASES
 from benchmarks.stress_systems import latch
 from jast import distributions as D
 from jast._src.distributions.independent_parts import parts
+from jast._src.estimate.proposal_search import by_proposal
 from jast._src.estimate.proposal_search.adapt import adapt_proposal
 from jast._src.estimate.proposal_search.search_state import SearchState, search_context
 from jast._src.estimate.proposal_search.settings import SETTINGS
@@ -254,6 +255,19 @@ def test_first_passage():
     sim = autoregression(threshold=4.5, horizon=40)
     found = failure_probability(jax.random.key(0), sim, BUDGET)
     check_estimate(found, autoregression_probability(0.1, 4.5, 40))
+
+
+def test_populations_answer_where_tilts_do_not_serve(monkeypatch):
+    """Gaussians of all steps are not tried, and the answer holds within 4 standard errors."""
+    monkeypatch.setattr(by_proposal.Search, "suffices", property(lambda search: False))
+    found = failure_probability(
+        jax.random.key(0), autoregression(threshold=4.5, horizon=40), 50_000
+    )
+    truth = autoregression_probability(0.1, 4.5, 40)
+    assert "populations" in found.method and "tilts" in found.history[0]
+    assert not any("Gaussians" in line for line in found.history)
+    assert abs(found.log_mean - np.log(truth)) < 4 * found.relative_error < 2
+    assert found.plain[-1] > 0 and found.evaluations < 60_000
 
 
 @pytest.mark.long

@@ -78,8 +78,10 @@ def failure_probability(
     is UNRELIABLE. Systems of 30 steps or more, or whose disturbances hold choices (Bernoulli,
     Categorical), are first tried with tilts: each step's own disturbance is tilted by the state and
     the time, choices by their odds, and the tilts are fitted by cross-entropy; a normal number
-    comes from one of three Gaussians where a single one serves badly. Others are tried with tilts
-    where the Gaussians promise few effective draws.
+    comes from one of three Gaussians where a single one serves badly. Where tilts do not serve
+    them, populations spend what is left (of calls of 40,000 evaluations or more, without
+    ``failures`` or ``near``, and not of black boxes). Others are tried with tilts where the
+    Gaussians promise few effective draws.
 
     What is left of the budget, about half, is drawn from the proposal as it then stands. The
     estimate and its interval come from these episodes alone. A tenth of them or more, up to two
