@@ -75,7 +75,7 @@ class Request(NamedTuple):
     settings: SearchSettings = SETTINGS
     otherwise: Callable[[int], Estimate] | None = None
     """What answers with so many evaluations, in the place of Gaussians, where a system has many
-    steps and tilts do not serve. In the 400 numbers of a cart-pole Gaussians took three quarters of
+    steps and tilts do not serve. In the 400 numbers of a cart-pole Gaussians took seven tenths of
     the time, and had an effective draw or two of 4000."""
 
 
