@@ -64,7 +64,7 @@ class Door(NamedTuple):
 
 
 SYSTEMS = {
-    "gymnax": Door("gymnax", 1_000_000, 20, 1.577e-3, 0.012, 2**19),
+    "gymnax": Door("gymnax", 1_000_000, 20, 1.603e-3, 0.0086, 2**19),
     "pendulum": Door("gymnax", 1_000_000, 20, 1.682e-4, 0.019, 2**20),
     "MJX": Door("mujoco.mjx", 20_000, 2, 9.956e-4, 0.062, 2**14),
     "brax": Door("brax", 20_000, 2, 4.532e-2, 0.025, 2**11),

@@ -209,6 +209,7 @@ def failure_probability(
     if more is not None:
         again = failure_probability(
             *(key, sim, more),
+            gradients=gradients,
             level=level,
             progress=progress,
             callback=callback,
