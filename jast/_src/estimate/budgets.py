@@ -29,7 +29,9 @@ __all__ = [
 DEFAULT_SECONDS = 8.0
 """CPU seconds of simulation that a call takes by default; the rest of ten is compilation."""
 MIN_POPULATION_BUDGET = 300_000
-"""Evaluations from which populations answer sooner than a proposal that is found with few."""
+"""Evaluations from which populations answer rather than a proposal. Of the drone, the grid and the
+crossing of `benchmarks.closed_loops` they have standard errors of 12 to 16 % with 100,000 and of 6
+to 8 % with 300,000; a proposal of tilts has 1 % of the drone with 100,000."""
 MAX_DEFAULT_BUDGET = 2**25
 """Evaluations by default at most: static problems of few numbers are then answered within 3 % down
 to 1e-9, in seconds."""
