@@ -21,6 +21,7 @@ from jast._src.estimate.multilevel import FailureProposal, failure_proposal
 from jast._src.estimate.population.failure_sample import Sample
 from jast._src.estimate.population.population import population
 from jast._src.estimate.proposals import Proposal, policy_proposal, trace_proposal
+from jast._src.estimate.splitting.splitting import splitting
 from jast._src.estimate.subset_simulation import subset_simulation
 from jast._src.estimate.weighted_draws import Draws
 from jast._src.util.doors import dir_function
@@ -59,6 +60,7 @@ __all__ = [
     "pareto_k",
     "policy_proposal",
     "population",
+    "splitting",
     "subset_simulation",
     "trace_proposal",
 ]

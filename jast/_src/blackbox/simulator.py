@@ -17,6 +17,7 @@ from jast import distributions as D
 from jast._src.blackbox.compare import compare
 from jast._src.blackbox.host_calls import Calls, Host
 from jast._src.blackbox.pool import Pool, pack
+from jast._src.blackbox.snapshots import BranchingRunner
 from jast._src.blackbox.worker import METHODS, Runner, Spec, takes
 from jast._src.core.check import OBSERVED
 from jast._src.core.simulator import Simulator, fixed, translating
@@ -300,6 +301,8 @@ class _Asking:
         self.incidents, self.calls = host.incidents, host.calls
         if host.spec.episodic and not host.spec.run:
             self.compare = partial(compare, host)
+        if not host.spec.episodic:
+            self.branching = partial(BranchingRunner, host)
 
     def __call__(self, *args):
         return self.function(self.host, *args)

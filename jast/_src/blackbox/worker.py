@@ -30,6 +30,7 @@ __all__ = [
     "history",
     "install",
     "line_of",
+    "said",
     "takes",
 ]
 
@@ -169,7 +170,7 @@ class Runner:
         except KeyboardInterrupt:
             raise
         except BaseException as error:
-            return f"the first object could not be made: {_said(error)[1]}"
+            return f"the first object could not be made: {said(error)[1]}"
         return size
 
     def __call__(self, t, x0, xs, lanes=None):
@@ -192,7 +193,7 @@ class Runner:
                 raise
             except BaseException as error:  # SystemExit too: the system's, not ours
                 terminal[i] = True
-                problems.append((i, *_said(error)))
+                problems.append((i, *said(error)))
         return Reply(
             event=event,
             distance=distance,
@@ -263,20 +264,29 @@ class Runner:
             with self.alarm:
                 answer = self._initialize(thing, x0)
         for k in range(at, t):
-            with self.alarm:
-                log_p = self._transition(thing, fill(self.x, [a[k] for a in xs]))
-                answer = _evaluate(thing)
-        with self.alarm:
-            log_p, *outcome = self._outcome(thing, log_p, answer)
-            ended = hasattr(thing, "is_terminal") and _event(thing.is_terminal(), "is_terminal")
-            observed = _observed(thing.observe(), self.size) if self.size else None
-        if outcome[0] or ended or t >= self.spec.horizon:
+            log_p, answer = self._move(thing, fill(self.x, [a[k] for a in xs]))
+        seen = self._look(thing, log_p, answer)
+        event, _, ended, *_ = seen
+        if event or ended or t >= self.spec.horizon:
             self.spare.append(thing)
         else:
             self.kept.setdefault(history(x0, xs, t), []).append(thing)
             self.count += 1
             if self.count > KEPT:
                 self.spare.append(self._take(next(iter(self.kept))))
+        return seen
+
+    def _move(self, thing, x):
+        """log p of a disturbance and what ``evaluate`` returned after it."""
+        with self.alarm:
+            return self._transition(thing, x), _evaluate(thing)
+
+    def _look(self, thing, log_p, answer):
+        """Event, distance, terminal, log p and observation of an object at its state."""
+        with self.alarm:
+            log_p, *outcome = self._outcome(thing, log_p, answer)
+            ended = hasattr(thing, "is_terminal") and _event(thing.is_terminal(), "is_terminal")
+            observed = _observed(thing.observe(), self.size) if self.size else None
         return *outcome, ended, log_p, observed
 
     def _initialize(self, thing, x0):
@@ -411,7 +421,7 @@ def _show(value):
     return text if len(text) <= 80 else f"{type(value).__name__} {text[:70]} ..."
 
 
-def _said(error):
+def said(error):
     """(kind, message) of what the system raised."""
     if isinstance(error, TimedOut):
         return "timed out", str(error)

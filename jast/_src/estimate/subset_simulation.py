@@ -12,6 +12,7 @@ import numpy as np
 from jast._src.core.simulator import Simulator
 from jast._src.estimate.estimate import Estimate, estimate_from_mean
 from jast._src.estimate.host_populations import FINAL_MOVES, LEVEL_SHARE, Explored, explore
+from jast._src.estimate.replicates import MIN_REPLICATES, mean_of_replicates
 from jast._src.normal_space import transform
 from jast._src.runtime import work
 from jast._src.runtime.backends import Task
@@ -20,7 +21,7 @@ from jast._src.runtime.memory import require_episodes
 from jast._src.runtime.progress_bar import Watch
 from jast._src.util.checks import check_random_key, whole_number
 from jast._src.util.display import call_settings
-from jast._src.util.intervals import checked_level, log_normal, student_factor
+from jast._src.util.intervals import checked_level
 
 if TYPE_CHECKING:
     import chex
@@ -34,14 +35,10 @@ LOST_MODE_REMARK = (
 )
 MIN_SAMPLES = 100
 """Members of a population at least: levels are quantiles of them."""
-MIN_REPLICATES = 3
-"""Populations at least: their spread is the standard error."""
 FALLBACK_REPLICATES = 5
 """Populations where no proposal was found."""
 MIN_LOG_PROBABILITY = -690.0
 """Where a population gives up: the log of the least double, nearly."""
-MAX_REPLICATE_ERROR = 0.5
-"""Relative standard error of the populations above which they disagree. A convention."""
 
 
 def subset_simulation(
@@ -136,40 +133,26 @@ def estimate_from_replicates(
     method: str, runs: Sequence[Explored], samples: int, level: float, reasons: Sequence[str] = ()
 ) -> Estimate:
     """The `Estimate` of independent populations of ``samples``; ``reasons`` speak against it."""
-    replicates = len(runs)
-    logs = np.array([float(r.log_mean) for r in runs])
+    found = mean_of_replicates([float(r.log_mean) for r in runs], "populations", level)
+    reasons = (*reasons, *found.reasons)
     history = tuple(
         f"population: {len(r.levels)} levels, log p {r.log_mean:.3f}, {r.evaluations} evaluations"
         for r in runs
     )
-    seen, found = int(np.isfinite(logs).sum()), list(reasons)
-    if seen < replicates:
-        found.append(f"{replicates - seen} of {replicates} populations reached no failure")
-    log_mean = relative = max_share = math.nan
-    interval, ess = (0.0, 1.0), 0.0
-    if seen:
-        p = np.exp(logs - logs.max())
-        log_mean = float(logs.max()) + math.log(p.mean())
-        relative = float(p.std(ddof=1) / math.sqrt(replicates) / p.mean())
-        # few replicates: Student's t in place of the normal quantile, as a wider error
-        interval = log_normal(log_mean, relative * student_factor(replicates - 1, level), level)
-        ess, max_share = float(p.sum() ** 2 / (p**2).sum()), float(p.max() / p.sum())
-    if relative > MAX_REPLICATE_ERROR:
-        found.append(f"the replicates disagree: relative standard error {relative:.0%}")
     return estimate_from_mean(
         method,
-        log_mean,
-        relative,
+        found.log_mean,
+        found.relative,
         level,
-        interval,
-        ess=ess,
-        max_share=max_share,
+        found.interval,
+        ess=found.ess,
+        max_share=found.max_share,
         failing=sum(len(r.points) for r in runs),
         samples=sum(max(len(r.points), samples) for r in runs),
         episodes=int(sum(r.evaluations for r in runs)),
         invalid=int(sum(r.invalid for r in runs)),
-        reliable=not found,
-        warnings=(*found, LOST_MODE_REMARK),
+        reliable=not reasons,
+        warnings=(*reasons, LOST_MODE_REMARK),
         history=history,
     )
 
