@@ -44,6 +44,7 @@ SMALLEST = {  # beside each other what shares compiled programs
     "reliability": ["--smoke"],
     "scale": ["--smoke"],
     "search_settings": ["--smoke"],
+    "splitting": ["--smoke"],
     "stress": ["--smoke"],
     "sweep": ["--smoke"],
     "table1_seeds": ["--smoke"],

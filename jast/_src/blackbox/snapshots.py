@@ -45,6 +45,11 @@ class BranchingRunner(Runner):
     """
 
     def __init__(self, host):
+        if not isinstance(host.runner, Runner):
+            raise ValueError(
+                "splitting: sim must be a black box with workers=0, whose objects are in this"
+                " process; for several processes give executor="
+            )
         super().__init__(host.runner.system, host.spec)
         self.configure(host.runner.x, host.runner.size)
         self.host = host

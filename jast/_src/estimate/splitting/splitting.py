@@ -59,8 +59,8 @@ def splitting(
     executor: Executor | None = None,
     devices: Sequence[jax.Device] | None = None,
 ) -> Estimate:
-    """Adaptive multilevel splitting (Cerou and Guyader 2007): episodes that get nowhere are dropped,
-    and others that came nearer to a failure go on twice from where they did. For long episodes of
+    """Adaptive multilevel splitting (Cerou and Guyader 2007): episodes that get nowhere are
+    dropped, and others that came nearer to a failure go on twice from there. For long episodes of
     many random numbers, and for black boxes with steps, which are resumed and not run again.
 
     A run has ``particles`` episodes. Again and again it drops the quarter whose best state is worst
@@ -124,9 +124,9 @@ def splitting(
     runs = whole_number(NAME, "runs", runs, MIN_REPLICATES)
     level = checked_level(NAME, level)
     contract(NAME, sim)
+    objects, before = branching_objects(NAME, sim), incidents(sim)
     score = _checked_score(sim, score)
     _check_states(sim, score)
-    objects, before = branching_objects(NAME, sim), incidents(sim)
     if objects is None:
         require_paths(NAME, sim, particles)
     ways = work.placement(NAME, executor, devices)
