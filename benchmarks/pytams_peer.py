@@ -1,5 +1,5 @@
-"""pyTAMS on the two channels of benchmarks.splitting, in plain Python as its models are; pip install
-pytams. It draws from NumPy's own entropy, so no key repeats it.
+"""pyTAMS (pip install pytams) on the two channels of benchmarks.splitting, in plain Python as its
+models are. It draws from NumPy's own entropy, so no key repeats it.
 """
 
 import math

@@ -19,11 +19,13 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.tree_util import Partial
 
 import jast
 from benchmarks import pytams_peer
+from benchmarks.closed_loops import system
 from benchmarks.sizes import add_choices, installed, options, print_report, printer, size
-from jast import distributions as D
+from benchmarks.time_to_answer import toy_step, well_distance, well_step
 
 __all__ = ["SYSTEMS", "Diffusion"]
 
@@ -35,110 +37,55 @@ RUNS = 4
 class Diffusion(NamedTuple):
     """A system and the probability that its episode fails."""
 
-    make: Callable[[], jast.Simulator]
+    simulator: jast.Simulator
     truth: float
     particles: int
     """Of a run of splitting: four of them take about 1e4 episodes"""
+    score: Callable[[Any], Any] | None = None
 
 
-def _pair(state: Any) -> Any:
-    return D.Independent(D.Normal(jnp.zeros(2), 1.0), 1)
-
-
-def _slope(s: Any) -> Any:
-    """Of the potential with two channels."""
+def channels_step(s: Any, w: Any) -> Any:
+    """A particle at temperature 1 / 5.67 in a potential of two wells, with two ways between."""
     x, y = s
     hill, dip = jnp.exp(-(x**2) - (y - 1 / 3) ** 2), jnp.exp(-(x**2) - (y - 5 / 3) ** 2)
     right, left = jnp.exp(-((x - 1) ** 2) - y**2), jnp.exp(-((x + 1) ** 2) - y**2)
-    return jnp.stack(
-        [
-            0.8 * x**3 - 6 * x * hill + 6 * x * dip + 10 * (x - 1) * right + 10 * (x + 1) * left,
-            0.8 * (y - 1 / 3) ** 3
-            - 6 * (y - 1 / 3) * hill
-            + 6 * (y - 5 / 3) * dip
-            + 10 * y * (right + left),
-        ]
-    )
+    along = 0.8 * x**3 - 6 * x * (hill - dip) + 10 * ((x - 1) * right + (x + 1) * left)
+    across = 0.8 * (y - 1 / 3) ** 3 - 6 * (y - 1 / 3) * hill + 6 * (y - 5 / 3) * dip
+    slope = jnp.stack([along, across + 10 * y * (right + left)])
+    return s - 0.01 * slope + math.sqrt(2 * 0.01 / 5.67) * w
 
 
-def two_channels(beta: float = 5.67, dt: float = 0.01, steps: int = 2000) -> jast.Simulator:
-    """From one well: failure where it is 2.1 away from the bottom of that."""
-
-    def evaluate(s):
-        gap = 2.1 - jnp.hypot(s[0] + 1, s[1])
-        return gap <= 0, jnp.maximum(gap, 0.0)
-
-    return jast.Simulator(
-        init=lambda x0: jnp.array([-0.9, 0.1]),
-        step=lambda s, w: s - dt * _slope(s) + math.sqrt(2 * dt / beta) * w,
-        disturbance=_pair,
-        evaluate=evaluate,
-        horizon=steps,
-    )
+def channels_distance(s: Any) -> Any:
+    """To 2.1 from the bottom of the first well."""
+    return 2.1 - jnp.hypot(s[0] + 1, s[1])
 
 
-def double_well(eps: float = 0.1, dt: float = 0.01, steps: int = 500) -> jast.Simulator:
-    """From one well: failure at the bottom of the other."""
-
-    def step(s, w):
-        drift = jnp.stack([s[0] - s[0] ** 3, -2 * s[1]])
-        return s + dt * drift + math.sqrt(dt * eps) * w
-
-    def evaluate(s):
-        left, right = (jnp.exp(-8 * ((s[0] - m) ** 2 + s[1] ** 2)) for m in (-1, 1))
-        gap = 0.95 - (0.5 - 0.5 * left + 0.5 * right)
-        return gap <= 0, jnp.maximum(gap, 0.0)
-
-    return jast.Simulator(
-        init=lambda x0: jnp.array([-1.0, 0.0]),
-        step=step,
-        disturbance=_pair,
-        evaluate=evaluate,
-        horizon=steps,
-    )
+def toy_distance(s: Any) -> Any:
+    return 3.0 - s[0] - 2 * s[1]
 
 
-class At(NamedTuple):
-    """A place, and how many steps led there."""
-
-    at: Any
-    steps: Any
-
-
-def toy(level: float = 3.0, eps: float = 0.5, steps: int = 50) -> jast.Simulator:
-    """Failure where X + 2 Y is at least ``level`` at time 1."""
-    dt = 1 / steps
-
-    def step(s, w):
-        x, y = s.at
-        drift = jnp.stack([-x - x * y, -4 * y + x**2])
-        noise = math.sqrt(eps * dt) * jnp.array([1.0, 0.5]) * w
-        return At(s.at + dt * drift + noise, s.steps + 1)
-
-    def evaluate(s):
-        gap = level - s.at[0] - 2 * s.at[1]
-        return (gap <= 0) & (s.steps == steps), jnp.maximum(gap, 0.0)
-
-    return jast.Simulator(
-        init=lambda x0: At(jnp.zeros(2), jnp.zeros((), jnp.int32)),
-        step=step,
-        disturbance=_pair,
-        evaluate=evaluate,
-        horizon=steps,
-    )
+def _toy_score(s: Any) -> Any:
+    return -toy_distance(s)
 
 
 SYSTEMS = {
-    "two channels": Diffusion(two_channels, 6.011e-5, 500),
-    "double well": Diffusion(double_well, 1.342e-3, 800),
-    "toy": Diffusion(toy, 1.0877e-5, 600),
+    "two channels": Diffusion(
+        system([-0.9, 0.1], channels_step, channels_distance, 2, 2000), 6.011e-5, 500
+    ),
+    "double well": Diffusion(system([-1.0, 0.0], well_step, well_distance, 2, 500), 1.342e-3, 750),
+    "toy": Diffusion(
+        system([0.0, 0.0], Partial(toy_step, 50), toy_distance, 2, 50, episodic=True),
+        1.0877e-5,
+        500,
+        _toy_score,
+    ),
 }
 
 
-def estimates(system: str, method: str, keys: int, particles: int) -> list[dict[str, Any]]:
+def estimates(name: str, method: str, keys: int, particles: int) -> list[dict[str, Any]]:
     """An estimate for each key: its ratio to the truth, and what it took."""
-    diffusion, found = SYSTEMS[system], []
-    sim = diffusion.make()
+    diffusion, found = SYSTEMS[name], []
+    sim = diffusion.simulator
     for number in range(keys):
         key, begun = jax.random.key(number), time.process_time()
         if method == "pytams":
@@ -146,7 +93,7 @@ def estimates(system: str, method: str, keys: int, particles: int) -> list[dict[
             row = dict(relative_error=None, covered=None, flagged=False)
             row |= dict(ratio=mean / diffusion.truth, episodes=steps / sim.horizon)
         else:
-            p = _estimate(key, sim, method, particles)
+            p = _estimate(key, diffusion, method, particles)
             low, high = p.interval
             row = dict(
                 ratio=0.0 if math.isnan(p.mean) else p.mean / diffusion.truth,
@@ -159,13 +106,14 @@ def estimates(system: str, method: str, keys: int, particles: int) -> list[dict[
     return found
 
 
-def _estimate(key, sim, method, particles):
+def _estimate(key, diffusion, method, particles):
     if method == "splitting":
-        return jast.estimate.splitting(key, sim, particles, runs=RUNS)
+        score = diffusion.score
+        return jast.estimate.splitting(key, diffusion.simulator, particles, runs=RUNS, score=score)
     episodes = 20 * particles  # what splitting takes of these systems, about
     if method == "plain":
-        return jast.estimate.monte_carlo(key, sim, episodes)
-    return jast.estimate.failure_probability(key, sim, episodes)
+        return jast.estimate.monte_carlo(key, diffusion.simulator, episodes)
+    return jast.estimate.failure_probability(key, diffusion.simulator, episodes)
 
 
 def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
@@ -189,7 +137,7 @@ def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
 
 
 def main() -> None:
-    parser = options(__doc__, "4 keys, and no plain draws")
+    parser = options(__doc__, "4 keys, without plain draws")
     parser.add_argument("--keys", type=int, help="default: 16; 4 with --quick, 1 with --smoke")
     parser.add_argument("--particles", type=int, help="of a run; default: by the system")
     add_choices(parser, "--systems", SYSTEMS)
@@ -197,15 +145,15 @@ def main() -> None:
     args = parser.parse_args()
     say, report = printer(args), {}
     keys = args.keys or size(args, 16, 4, 1)
-    for system in args.systems or size(args, list(SYSTEMS), list(SYSTEMS), ["toy"]):
-        particles = args.particles or size(args, *[SYSTEMS[system].particles] * 2, 20)
+    for name in args.systems or size(args, list(SYSTEMS), list(SYSTEMS), ["toy"]):
+        particles = args.particles or size(args, *[SYSTEMS[name].particles] * 2, 20)
         for method in args.methods or size(args, ["splitting", "plain"], *[["splitting"]] * 2):
-            if method == "pytams" and not (installed("pytams") and system == "two channels"):
+            if method == "pytams" and not (installed("pytams") and name == "two channels"):
                 continue
-            r = summary(estimates(system, method, keys, particles))
-            report[f"{system}, {method}"] = r
+            r = summary(estimates(name, method, keys, particles))
+            report[f"{name}, {method}"] = r
             say(
-                f"{system:13} {method:20} rms {r['rms']:.3f} mean {r['mean']:.3f}, covered"
+                f"{name:13} {method:20} rms {r['rms']:.3f} mean {r['mean']:.3f}, covered"
                 f" {r['covered']} flagged {r['flagged']} silent {r['silent']} of {r['keys']},"
                 f" {r['episodes']:.0f} episodes, {r['cpu_s']:.1f} CPU s"
             )

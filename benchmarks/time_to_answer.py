@@ -27,7 +27,15 @@ from jast._src.normal_space.evaluate_points import judged
 from jast._src.normal_space.transform import dimension
 from jast.simulators import limit_state
 
-__all__ = ["SYSTEMS", "System", "plain_draws", "row_of"]
+__all__ = [
+    "SYSTEMS",
+    "System",
+    "plain_draws",
+    "row_of",
+    "toy_step",
+    "well_distance",
+    "well_step",
+]
 
 
 class System(NamedTuple):
