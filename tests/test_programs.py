@@ -109,6 +109,7 @@ CALLS = {
     "estimate.population": Call(
         lambda k, b, _: estimate.population(k, FAILS, b, particles=512), 60_000, 80_000
     ),
+    "estimate.splitting": Call(lambda k, b, _: estimate.splitting(k, FAILS, b, runs=3), 100, 150),
     "estimate.subset_simulation": Call(
         lambda k, b, _: estimate.subset_simulation(k, FAILS, b, replicates=4), 500, 700
     ),

@@ -125,6 +125,8 @@ def from_python(
       ``miss_distance() -> float``, ``is_event() -> bool``, and optionally ``evaluate()`` (runs the
       system under test), ``is_terminal() -> bool`` and ``observe() -> vector``: Table 3.1 of Moss's
       thesis. ``initialize`` puts an object back to the start, as it serves many episodes.
+      For `jast.estimate.splitting` it may have ``snapshot()``, which returns its state, and
+      ``restore(saved)``, which brings it back as often as asked; else it is copied.
       `jast.blackbox.gymnasium_system` makes one of an environment.
 
     What goes wrong (an exception, no answer in time, a process that dies, another answer than a
