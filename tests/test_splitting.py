@@ -322,7 +322,7 @@ def test_what_goes_wrong_in_an_object_is_an_invalid_episode(key):
     found = splitting(key, black_box(Raises), 50, runs=6)
     assert off(found, autoregression_probability(low=-1.0)) < MAX_ERRORS
     assert found.invalid > 0
-    assert any("lost" in text for text in found.warnings)
+    assert any("OSError: lost" in text for text in found.warnings)
 
 
 # wrong

@@ -12,7 +12,7 @@ import numpy as np
 from jast._src.core.simulator import Simulator
 from jast._src.estimate.estimate import Estimate, estimate_from_mean
 from jast._src.estimate.host_populations import FINAL_MOVES, LEVEL_SHARE, Explored, explore
-from jast._src.estimate.replicates import MIN_REPLICATES, mean_of_replicates
+from jast._src.estimate.replicates import LOST_MODE_REMARK, MIN_REPLICATES, mean_of_replicates
 from jast._src.normal_space import transform
 from jast._src.runtime import work
 from jast._src.runtime.backends import Task
@@ -30,9 +30,6 @@ if TYPE_CHECKING:
 
 __all__ = ["fallback_estimate", "subset_simulation"]
 
-LOST_MODE_REMARK = (
-    "a failure mode that few members of a population reach can be lost without a sign"
-)
 MIN_SAMPLES = 100
 """Members of a population at least: levels are quantiles of them."""
 FALLBACK_REPLICATES = 5

@@ -15,7 +15,7 @@ from jast._src.core.float_resolution import rounding_problem
 from jast._src.core.signature import outline
 from jast._src.estimate.estimate import Estimate, estimate_from_mean
 from jast._src.estimate.population.search import Answer, contradictions
-from jast._src.estimate.replicates import MIN_REPLICATES, mean_of_replicates
+from jast._src.estimate.replicates import LOST_MODE_REMARK, MIN_REPLICATES, mean_of_replicates
 from jast._src.estimate.splitting.device_paths import DevicePaths, require_paths
 from jast._src.estimate.splitting.levels import Run, climb
 from jast._src.estimate.splitting.object_paths import ObjectPaths, branching_objects, check_objects
@@ -67,8 +67,9 @@ def splitting(
     (with all that tie with these), and replaces each by a branch of one that is left, from the
     first state that is better than all of the dropped, with new disturbances. The estimate is
     unbiased whatever the score, also one of few values (Brehier, Gazeau, Goudenege, Lelievre and
-    Rousset 2016); a poor score makes it spread. Standard error and interval are those of
-    independent ``runs`` (Student's t).
+    Rousset 2016). But with a poor score rare runs carry most of it, and the others agree on too
+    little without a sign. Standard error and interval are those of independent ``runs`` (Student's
+    t).
 
     It needs draws only: no quantile functions, no densities, and disturbances of unknown density
     (`jast.distributions.seeds`) serve as well. Episodes that turn invalid count as not failing.
@@ -193,7 +194,7 @@ def _estimate(runs, horizon, checked, level, reasons, notes):
         steps=steps,
         invalid=sum(int(r.invalid) for r in runs),
         reliable=not reasons,
-        warnings=(*reasons, *notes),
+        warnings=(*reasons, *notes, LOST_MODE_REMARK),
         history=tuple(map(_words, runs)),
         plain=plain,
     )
