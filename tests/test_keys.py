@@ -27,6 +27,7 @@ CALLS = {
     "importance": lambda key: E.importance(key, walk1d(), None),
     "log_weights": lambda key: E.log_weights(key, walk1d(), None, 2),
     "failure_probability": lambda key: E.failure_probability(key, walk1d()),
+    "splitting": lambda key: E.splitting(key, walk1d()),
     "subset_simulation": lambda key: E.subset_simulation(key, walk1d()),
     "adaptive_cross_entropy": lambda key: E.adaptive_cross_entropy(key, walk1d()),
     "failure_proposal": lambda key: E.failure_proposal(key, walk1d()),

@@ -42,10 +42,10 @@ def unit(state):
 def autoregression(**changed):
     """s += x - s / 5 from 0; failure at 5 or above."""
     fields = dict(init=lambda x0: jnp.zeros(()), step=pulled, disturbance=unit, evaluate=beyond)
-    return jast.Simulator(horizon=STEPS, **(fields | changed))
+    return jast.Simulator(**(fields | dict(horizon=STEPS) | changed))
 
 
-def autoregression_probability(low=-30.0, spread=0.0, nodes=400):
+def autoregression_probability(low=-30.0, spread=0.0, steps=STEPS, nodes=400):
     """By its transition operator on Gauss and Legendre's points between ``low``, below which an
     episode ends without a failure, and the limit; from N(0, spread^2).
     """
@@ -53,7 +53,7 @@ def autoregression_probability(low=-30.0, spread=0.0, nodes=400):
     x, w = low + (x + 1) / 2 * (LIMIT - low), w / 2 * (LIMIT - low)
     value = np.zeros(nodes)  # of the probability to fail yet
     at = np.append(x, 0.0)
-    for _ in range(STEPS):
+    for _ in range(steps):
         inside = stats.norm.pdf(x - 0.8 * at[:, None]) * w @ value
         value, first = np.split(stats.norm.sf(LIMIT - 0.8 * at) + inside, [nodes])
     if not spread:
@@ -178,6 +178,11 @@ CASES = {
         {},
         autoregression_probability(spread=1.5),
     ),
+    "one step from a random start": (
+        lambda: autoregression(start=lambda: D.Normal(0.0, 1.5), init=lambda x0: x0, horizon=1),
+        {},
+        autoregression_probability(spread=1.5, steps=1),
+    ),
     "invalid episodes": (
         lambda: autoregression(evaluate=_nan_below),
         {},
@@ -247,6 +252,7 @@ def test_steps_and_episodes_are_counted(key):
         patch.setattr(levels, "MIN_LOG_PROBABILITY", -1.0)  # three levels, and no more
         found = splitting(key, sim, 100, runs=3)
     assert np.isnan(found.mean)
+    assert found.ess == 0
     assert not found.reliable
     assert found.samples == found.plain[2] == 300
     branches = 3 * 3 * 25

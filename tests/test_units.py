@@ -41,6 +41,7 @@ from jast.estimate import (
     failure_samples,
     importance,
     policy_proposal,
+    splitting,
     subset_simulation,
 )
 from jast.policies import sac
@@ -64,6 +65,7 @@ CALLS = {
     "importance": lambda key, **how: importance(
         key, walk1d(), policy_proposal(walk1d(), nominal_policy(walk1d())), EPISODES, **how
     ),
+    "splitting": lambda key, **how: splitting(key, LINE, 100, runs=3, **how),
     "subset_simulation": lambda key, **how: subset_simulation(key, LINE, 100, replicates=3, **how),
     "mcts": lambda key, **how: mcts(
         key, walk1d(), trees=3, simulations=30, lanes=1, refine=0, keep_trees=True, **how
@@ -71,7 +73,7 @@ CALLS = {
 }
 """A call of each kind, of a few units."""
 long = lambda name: pytest.param(name, marks=pytest.mark.long)
-LATER = ("mcts", "importance", "failure_probability")
+LATER = ("mcts", "importance", "failure_probability", "splitting")
 
 
 @pytest.fixture(autouse=True)

@@ -15,8 +15,8 @@ FRESH = -1
 """The parent of a new episode."""
 KILLED = 0.25
 """Share of the particles that a level kills at least. Each level costs a round trip, and more of
-them pay little: where p = 6e-5, variance times episodes is 2 % above that of one killed at a time,
-8 % with a half (of ideal levels)."""
+them pay little: with the best score and p = 6e-5, variance times branches is 2 % above that of one
+killed at a time, 8 % with a half."""
 MIN_LOG_PROBABILITY = -690.0
 """Where a run gives up: the log of the least double, nearly."""
 

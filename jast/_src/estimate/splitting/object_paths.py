@@ -22,8 +22,8 @@ from jast._src.runtime.host_errors import sources
 __all__ = ["ObjectPaths", "branching_objects", "check_objects"]
 
 LANES = 32
-"""Objects that are moved side by side, by one draw of disturbances: then drawing them costs some
-hundredths of a millisecond a transition."""
+"""Objects that are moved side by side, by one draw of disturbances for all of them; so many are
+alive at once."""
 
 
 class Branch(NamedTuple):

@@ -186,7 +186,7 @@ def _estimate(runs, horizon, checked, level, reasons, notes):
         found.relative,
         level,
         found.interval,
-        ess=found.relative**-2 if found.relative > 0 else math.inf,
+        ess=_worth(found.relative),
         max_share=found.max_share,
         failing=sum(int(r.failing) for r in runs),
         samples=plain[2],
@@ -198,6 +198,13 @@ def _estimate(runs, horizon, checked, level, reasons, notes):
         history=tuple(map(_words, runs)),
         plain=plain,
     )
+
+
+def _worth(relative):
+    """Of how many failing draws a count would be as sure; 0 where none was seen."""
+    if math.isnan(relative):
+        return 0.0
+    return relative**-2 if relative > 0 else math.inf
 
 
 def _words(r):
