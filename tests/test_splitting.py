@@ -291,6 +291,7 @@ def test_objects_go_on_from_where_they_were(kind, key):
     assert found.episodes == math.ceil(found.steps / STEPS)
 
 
+@pytest.mark.long
 def test_objects_and_arrays_come_to_the_same_in_the_mean(key):
     """A start and disturbances that depend on the state, a score of the state, and an early end."""
 
@@ -419,6 +420,10 @@ def test_black_boxes_that_cannot_branch(key):
     )
     with pytest.raises(ValueError, match="splitting: .*cannot be resumed"):
         splitting(key, run)
+
+
+@pytest.mark.long
+def test_objects_in_other_processes_cannot_branch(key):
     with pytest.raises(ValueError, match="splitting: .*workers=0"):
         splitting(key, black_box(Walker, workers=1))
 
