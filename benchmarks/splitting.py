@@ -3,8 +3,9 @@ steps: ``python -m benchmarks.splitting [--json] [--quick | --smoke] [--systems 
 [--methods NAME ...]``.
 
 ``two channels``: a metastable particle leaves its well by one of two ways within 2000 steps;
-``double well``: another crosses a barrier within 500; ``toy``: a two-scale diffusion is high at its
-last step, the 50th (Schorlepp and Grafke). Truths are recomputed by transition operators on grids.
+``channels by x``: the same, with its x in place of the distance for a score; ``double well``:
+another crosses a barrier within 500; ``toy``: a two-scale diffusion is high at its last step, the
+50th (Schorlepp and Grafke). Truths are recomputed by transition operators on grids.
 
 ``splitting``: `jast.estimate.splitting` by the distance; ``failure_probability`` and ``plain``
 draws (`monte_carlo`) with the episodes that it took; ``pytams`` (pip install pytams; not part of
@@ -64,6 +65,10 @@ def toy_distance(s: Any) -> Any:
     return 3.0 - s[0] - 2 * s[1]
 
 
+def _first(s: Any) -> Any:
+    return s[0]
+
+
 def _toy_score(s: Any) -> Any:
     return -toy_distance(s)
 
@@ -71,6 +76,9 @@ def _toy_score(s: Any) -> Any:
 SYSTEMS = {
     "two channels": Diffusion(
         system([-0.9, 0.1], channels_step, channels_distance, 2, 2000), 6.011e-5, 500
+    ),
+    "channels by x": Diffusion(
+        system([-0.9, 0.1], channels_step, channels_distance, 2, 2000), 6.011e-5, 500, _first
     ),
     "double well": Diffusion(system([-1.0, 0.0], well_step, well_distance, 2, 500), 1.342e-3, 750),
     "toy": Diffusion(
