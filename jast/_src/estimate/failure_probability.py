@@ -40,6 +40,8 @@ __all__ = ["MIN_BUDGET", "adaptive_cross_entropy", "failure_probability"]
 
 MIN_BUDGET = 5000
 """Episodes below which a surrogate answers."""
+MAX_SURROGATE_NUMBERS = 20
+"""Numbers of an episode up to which it does."""
 LEVELS = 20
 """Iterations of `adaptive_cross_entropy`."""
 
@@ -184,7 +186,7 @@ def failure_probability(
         ways = ways._replace(store=store)
         if not (guided or few):
             found = by_populations(name, key, sim, budget, level=level, watched=watched, ways=ways)
-        elif budget < MIN_BUDGET:
+        elif budget < MIN_BUDGET and transform.dimension(sim) <= MAX_SURROGATE_NUMBERS:
             found = few_calls.few_calls(key, sim, budget, level, known, progress, callback)
         else:
             # tilts may have spent half, and populations know nothing of failures given
@@ -204,7 +206,8 @@ def failure_probability(
                 ways=ways,
                 otherwise=partial(by_populations, name, key, sim, **about) if serve else None,
             )
-            found = flag_imprecise(estimate_by_proposal(wanted))
+            found = estimate_by_proposal(wanted)
+            found = flag_imprecise(found) if budget >= MIN_BUDGET else found
     more = budgets.next_budget(found, budget) if by_default and not few else None
     if more is not None:
         again = failure_probability(

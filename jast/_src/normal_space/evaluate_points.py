@@ -2,7 +2,9 @@
 number.
 """
 
+from collections.abc import Callable
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -34,25 +36,30 @@ class Judge:
         return judged(self.sim, np.asarray(points, self.dtype))
 
 
-def judged(sim: Simulator, z: np.ndarray) -> transform.Outcomes:
-    """`Outcomes` of the points ``z`` [n, D], on the host. One program serves every ``n``; a black
-    box runs once a point, in batches of ``n``.
+def judged(sim: Simulator, z: np.ndarray, play: Callable = transform.outcome) -> Any:
+    """`Outcomes` of the points ``z`` [n, D], on the host, or what ``play(sim, z)`` says of each.
+    One program serves every ``n``; a black box runs once a point, in batches of ``n``.
     """
     if runs_on_host(sim):
-        return answer_once(lambda z: transform.outcomes(sim, jnp.asarray(z)), z)
+        return answer_once(lambda z: _together(play, sim, jnp.asarray(z)), z)
     n, d = z.shape
     lanes, out = lanes_of(d), []
     for i in range(0, n, lanes):
         part = z[i : i + lanes]
-        out.append(answer_once(partial(_padded, sim, lanes), part, rows=len(part)))
-    return out[0] if len(out) == 1 else transform.Outcomes(*map(np.concatenate, zip(*out)))
+        out.append(answer_once(partial(_padded, play, sim, lanes), part, rows=len(part)))
+    return out[0] if len(out) == 1 else jax.tree.map(lambda *a: np.concatenate(a), *out)
 
 
-def _padded(sim, lanes, z):
-    """`Outcomes` [lanes], of which the first ones are of ``z`` [n, D]."""
+@partial(jit, static_argnums=0)
+def _together(play, sim, z):
+    return jax.vmap(partial(play, sim))(z)
+
+
+def _padded(play, sim, lanes, z):
+    """What ``play`` says [lanes], of which the first ones are of ``z`` [n, D]."""
     filled = np.zeros((lanes, z.shape[1]), z.dtype)
     filled[: len(z)] = z
-    return _in_blocks(sim, filled, np.int32(len(z)))
+    return _in_blocks(play, sim, filled, np.int32(len(z)))
 
 
 def lanes_of(d: int) -> int:
@@ -60,10 +67,12 @@ def lanes_of(d: int) -> int:
     return max(min(LANES, HELD // max(d, 1) // BLOCK * BLOCK), BLOCK)
 
 
-@jit
-def _in_blocks(sim, z, n):
-    """`Outcomes` of the first ``n`` of ``z``; of the others what is left of their blocks."""
-    run = jax.vmap(partial(transform.outcome, sim))
+@partial(jit, static_argnums=0)
+def _in_blocks(play, sim, z, n):
+    """What ``play`` says of the first ``n`` of ``z``; of the others what is left of their
+    blocks.
+    """
+    run = jax.vmap(partial(play, sim))
     like = jax.eval_shape(run, z)
 
     def block(i, out):

@@ -21,6 +21,7 @@ from jast._src.estimate import diagnostics, weight_sums
 from jast._src.estimate.estimate import Estimate, estimate_from_counts, estimate_from_weights
 from jast._src.estimate.gaussians.exploration import draw_model, explore_failures
 from jast._src.estimate.gaussians.family import GaussianFamily
+from jast._src.estimate.gaussians.moments import explore_moments
 from jast._src.estimate.importance_sampling import Traces, chunks
 from jast._src.estimate.monte_carlo import simulate_points
 from jast._src.estimate.proposal_search.adapt import adapt_proposal
@@ -32,7 +33,7 @@ from jast._src.estimate.proposal_search.search_state import (
     is_efficient,
     search_context,
 )
-from jast._src.estimate.proposal_search.settings import SETTINGS, SearchSettings
+from jast._src.estimate.proposal_search.settings import FEW_RUNS, SETTINGS, SearchSettings
 from jast._src.estimate.subset_simulation import fallback_estimate
 from jast._src.estimate.tilts.exploration import (
     absorb_given,
@@ -140,16 +141,29 @@ def _search(request, context):
 
 def _families(request):
     """The searches, in the order in which they are tried."""
+    few, s = (), request.settings
+    if transform.dimension(request.sim) >= s.moments_numbers and request.near is None:
+        if request.budget < s.moments_alone_budget:
+            return (_search_moments,)
+        few = (_search_moments,) if request.budget <= s.moments_budget else ()
     if _has_many_steps(request):
-        return (_search_tilts, _search_gaussians)[: 1 if request.otherwise else 2]
+        both = _search_tilts, _search_gaussians
+        return *few, *both[: 1 if request.otherwise else 2]
     near = (_search_tilts,) if isinstance(request.near, Tilts) else ()
-    return *near, _search_gaussians, _search_mixed_tilts
+    return *few, *near, _search_gaussians, _search_mixed_tilts
 
 
 def _has_many_steps(request):
     """Whether the system has many steps, or choices: tilts are then tried first."""
     about, horizon = shape(request.sim), request.sim.horizon
     return about.choices or about.choices0 or horizon >= request.settings.tilts_first_horizon
+
+
+def _search_moments(request, context, state):
+    """The `Search` for Gaussians beyond the boundary of each moment, from few runs."""
+    f = GaussianFamily(request.sim, request.budget, context, FEW_RUNS, "moments")
+    gradients = request.gradients and not runs_on_host(request.sim)
+    return Search(f, explore_moments(f, state, request.failure_points, gradients))
 
 
 def _search_gaussians(request, context, state):

@@ -4,13 +4,19 @@ on problems that are drawn by seed: ``python -m benchmarks.search_settings``.
 
 from typing import NamedTuple
 
-__all__ = ["SETTINGS", "SearchSettings"]
+__all__ = ["FEW_RUNS", "SETTINGS", "SearchSettings"]
 
 
 class SearchSettings(NamedTuple):
     """Shares are of the budget where nothing else is said."""
 
     # which family is tried
+    moments_budget: int = 20_000
+    """Evaluations up to which half-spaces of the moments of an episode come first."""
+    moments_alone_budget: int = 5000
+    """Evaluations below which nothing else is worth a try."""
+    moments_numbers: int = 21
+    """Numbers of an episode from which they do: with fewer a surrogate serves."""
     tilts_first_horizon: int = 30
     """Steps from which tilts are tried before Gaussians: Gaussians of many steps are dear, and miss
     what happens at any of them."""
@@ -192,3 +198,11 @@ class SearchSettings(NamedTuple):
 
 
 SETTINGS = SearchSettings()
+FEW_RUNS = SETTINGS._replace(
+    audits=2,
+    audit_share=0.35,
+    audit_population_least=20,
+    tolerated_mass=0.1,
+)
+"""Where half-spaces of moments are the proposal: a population that few runs afford finds modes that
+matter, and none of a hundredth of the probability."""
