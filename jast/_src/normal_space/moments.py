@@ -6,7 +6,7 @@ the episode has moments: it fails if any of them does.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -85,8 +85,8 @@ def slopes(sim: Simulator, point: np.ndarray, gradients: bool) -> Linearised:
     each towards the model's middle, where failures are rarer.
     """
     if gradients and sim.episodic:
-        g, slope = answer_once(_gradient, sim, point)
-        return Linearised(point, np.float64(g)[None], slope.astype(np.float64)[None])
+        g, slope = answer_once(_gradients, sim, point[None])
+        return Linearised(point, g.astype(np.float64), slope.astype(np.float64))
     step = np.where(point > 0, -STEP, STEP)
     moved = point + np.concatenate([np.zeros((1, len(point))), np.diag(step)]).astype(point.dtype)
     _, g = distances(sim, moved)
@@ -95,5 +95,6 @@ def slopes(sim: Simulator, point: np.ndarray, gradients: bool) -> Linearised:
 
 
 @quick
-def _gradient(sim: Simulator, z: jax.Array) -> tuple[jax.Array, Any]:
-    return jax.value_and_grad(lambda z: differentiable(sim, z).distance)(z)
+def _gradients(sim: Simulator, z: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Distances [n] and their gradients [n, D]."""
+    return jax.vmap(jax.value_and_grad(lambda z: differentiable(sim, z).distance))(z)

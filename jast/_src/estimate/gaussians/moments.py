@@ -46,10 +46,19 @@ ROUNDS = 6
 """Linearisations from one start at most."""
 GIVEN = 4
 """Failures that came with the call, and that no plane explains, from which others start."""
+ROOTS = 3
+"""Runs at most to see how deep a half-space is on the way to its own design point."""
+FARTHER = 2.0
+"""Standard deviations at most that one of them goes on."""
 LITTLE = 1e-3
 """Part of the greatest probability of a half-space, below which one is left out."""
 SAME = 0.9
 """Cosine above which two half-spaces of a moment are one."""
+ALIKE = 0.97
+"""Cosine above which the less likely of two is left out."""
+MOST = 64
+"""Half-spaces of a proposal at most: densities take their number times that of the numbers
+squared."""
 SPREAD = 2.0
 """Factor on the variance beyond a plane: with it, and a fifth of wide copies, .45 effective draws a
 draw where the plane is right, .2 where the boundary is .3 standard deviations nearer (one
@@ -67,6 +76,8 @@ class Planes(NamedTuple):
     """[K, D] of norm 1"""
     depth: np.ndarray
     moment: np.ndarray
+    rate: np.ndarray
+    """How much nearer to failing a standard deviation brings"""
     gap: np.ndarray
     """From where it was linearised to its nearest failing point"""
 
@@ -88,15 +99,15 @@ class Planes(NamedTuple):
 
 
 def explore_moments(
-    f: GaussianFamily, state: SearchState, given: np.ndarray | None, gradients: bool
+    f: GaussianFamily, given: np.ndarray | None, gradients: bool
 ) -> SearchState:
-    """The state with a proposal of the half-spaces that linearising leads to, fitted to a few
+    """The state of a search with a proposal of the half-spaces that linearising leads to, fitted to a few
     batches; without one where it leads to none. ``given`` [m, D]: failures that came with the call.
     """
-    state, start = _draw_model(f, state)
+    state, start = _draw_model(f, SearchState())
     if start is None:
         return state
-    end = state.spent + f.settings.refits_end * (f.budget - state.spent)
+    end = f.settings.exploration_end * f.budget
     planes = _none(f.dimension)
     state, planes = _approach(f, state, planes, start, gradients, end)
     for i in range(GIVEN if given is not None else 0):
@@ -115,11 +126,11 @@ def explore_moments(
     depths = f"at {planes.depth.min():.3f} to {planes.depth.max():.3f}"
     state = state.note(f"moments: {len(planes.depth)} half-spaces {depths}")
     state = state._replace(q=_proposal(f, planes), anchors=planes.nearest)
-    return _fit_shares(f, state, end)
+    return _fit_shares(f, state)
 
 
 def _none(d):
-    return Planes(np.zeros((0, d)), np.zeros(0), np.zeros(0, int), np.zeros(0))
+    return Planes(np.zeros((0, d)), np.zeros(0), np.zeros(0, int), np.zeros(0), np.zeros(0))
 
 
 def _draw_model(f, state):
@@ -143,42 +154,37 @@ def _draw_model(f, state):
 
 def _approach(f, state, planes, start, gradients, end):
     """The state and the `Planes` after linearising from ``start`` on, each time next to the nearest
-    boundary by the last one, until that is where it was said to be.
+    boundary that the last one led to, until that is where it was said to be.
     """
     cost = cost_of_slopes(f.sim, f.dimension, gradients)
-    state, start, _ = _step_back(f, state, start, np.zeros_like(start))
+    last = np.zeros_like(start)
     for _ in range(ROUNDS):
         if state.spent + cost + HALVINGS > end:
             return state.note("moments: no room for more slopes"), planes
+        state, start = _step_back(f, state, start, last)
         here = slopes(f.sim, start.astype(f.dtype), gradients)
-        new = _planes_of(here)
+        said = _planes_of(here)
         state = state.note(f"moments: linearised at {np.linalg.norm(start):.3f}", cost)
-        if not len(new.depth):
-            return state, planes
+        if not len(said.depth):
+            break
+        state, new = _to_their_roots(f, state, said)
         planes = _merge(planes, new)
         top = np.argmin(new.depth)
-        aim, moment = INSIDE * new.nearest[top], new.moment[top]
-        slope = here.slope[moment]
-        said = here.distance[moment] + slope @ (aim - start)
-        state, reached, g = _step_back(f, state, aim, start)
-        close = reached is aim and abs(g[moment] - said) <= KNOWN * np.linalg.norm(slope)
-        if close:
+        if abs(new.depth[top] - said.depth[top]) <= KNOWN:
             break
-        start = reached
+        last, start = start, INSIDE * new.nearest[top]
     return state, planes
 
 
 def _step_back(f, state, aim, safe):
-    """The state, and ``aim``, or a point between it and the ``safe`` one where it fails; and the
-    distances of its moments.
-    """
+    """The state, and ``aim``, or a point between it and the ``safe`` one where it fails."""
     for i in range(HALVINGS + 1):
         point = aim if i == 0 else (point + safe) / 2
-        o, g = distances(f.sim, point[None].astype(f.dtype))
+        o, _ = distances(f.sim, point[None].astype(f.dtype))
         state = state._replace(spent=state.spent + 1)
         if not (o.failure[0] or o.invalid[0]):
             break
-    return state, point, g[0]
+    return state, point
 
 
 def _planes_of(here: Linearised) -> Planes:
@@ -189,7 +195,7 @@ def _planes_of(here: Linearised) -> Planes:
     beyond = here.distance[moment] / size[moment]
     depth = normal @ here.point + beyond
     gap = np.linalg.norm(depth[:, None] * normal - here.point, axis=1)
-    return Planes(normal, depth, moment, gap).take(depth > 0)
+    return Planes(normal, depth, moment, size[moment], gap).take(depth > 0)
 
 
 def _merge(old: Planes, new: Planes) -> Planes:
@@ -221,11 +227,38 @@ def _with_mirror_images(f, state, planes):
     return state.note(text, len(failure)), planes
 
 
+def _to_their_roots(f, state, planes):
+    """The state, and the ``planes`` as deep as the system has them on the ray to each design
+    point, by the secant rule.
+    """
+    depth, unknown, runs = planes.depth.copy(), np.arange(len(planes.depth)), 0
+    for _ in range(ROOTS):
+        aim = INSIDE * depth[unknown, None] * planes.normal[unknown]
+        _, g = distances(f.sim, aim.astype(f.dtype))
+        left = np.nan_to_num(g[np.arange(len(unknown)), planes.moment[unknown]])
+        farther = np.minimum(left / planes.rate[unknown], FARTHER)
+        new = INSIDE * depth[unknown] + farther
+        runs += len(unknown)
+        far = np.abs(new - depth[unknown]) > KNOWN
+        depth[unknown], unknown = new, unknown[far]
+        if not len(unknown):
+            break
+    text = f"moments: {len(unknown)} of {len(depth)} boundaries not where they were said to be"
+    return state.note(text, runs), planes._replace(depth=depth)
+
+
 def _that_matter(planes: Planes, d: int) -> Planes:
-    """Those of great probability, as many as a proposal holds with their wide copies."""
+    """Those of great probability that differ from one another, as many as a proposal is to hold
+    with their wide copies.
+    """
     mass = planes.log_mass
-    order = np.argsort(-mass, kind="stable")[: most_components(d) // 2]
-    return planes.take(order[mass[order] > mass.max() + math.log(LITTLE)])
+    order = np.argsort(-mass, kind="stable")
+    order = order[mass[order] > mass.max() + math.log(LITTLE)]
+    most, kept = min(most_components(d) // 2, MOST), []
+    for i in order:
+        if len(kept) < most and (planes.normal[kept] @ planes.normal[i]).max(initial=-1) < ALIKE:
+            kept.append(i)
+    return planes.take(kept)
 
 
 def _proposal(f, planes):
@@ -247,12 +280,10 @@ def _proposal(f, planes):
     return as_latent(defensive_parts(g, 0.0, rare, f.settings), f.dtype)
 
 
-def _fit_shares(f, state, end):
+def _fit_shares(f, state):
     """The state after a few batches, each of shares that are fitted to all before it."""
     q = state.q
     for _ in range(BATCHES):
-        if state.spent + f.batch > end:
-            break
         batch = f.draw(q)
         state = add_batch(f, state, batch)
         failing, ess = len(batch.log_weight), 0.0
@@ -260,7 +291,7 @@ def _fit_shares(f, state, end):
             ess = effective_sample_size(batch.log_weight)
         text = f"moments: {failing / batch.size:.1%} fail, ESS {ess:.4g}"
         state = state.note(f"{text}; of all: log p {state.log_mean:.3f}", f.batch)
-        if not failing:
+        if state.efficiency < f.settings.family_efficiency:
             break
         q = _with_shares(state, q)
     return state

@@ -108,13 +108,32 @@ def estimate_by_proposal(request: Request) -> Estimate:
     context, coarse = search_context(request.key), rounding_problem(request.sim)
     reasons = [] if coarse is None else [coarse]
     try:
-        return _draw(request, _search(request, context), reasons)
+        return _answer(request, context, reasons)
     except (KeyboardInterrupt, jax.errors.JaxRuntimeError) as error:
         if not was_interrupted(error):
             raise
         if not context.latest:
             raise KeyboardInterrupt from error
         return _estimate_by_batches(request, Search(*context.latest[-1]), reasons)
+
+
+def _answer(request, context, reasons):
+    """The `Estimate`: with few runs of many numbers by the moments of an episode, where these
+    serve; else by the most efficient search, with what they left.
+    """
+    s = request.settings
+    many = transform.dimension(request.sim) >= s.moments_numbers
+    if not many or request.budget > s.moments_budget or request.near is not None:
+        return _draw(request, _search(request, context), reasons)
+    first = _search_moments(request, context)
+    serves = first.suffices and is_efficient(first.state, s.family_efficiency)
+    if serves or request.budget < s.moments_alone_budget:
+        return _draw(request, _audit(first) if serves else first, reasons)
+    state, rest = first.state, request._replace(budget=request.budget - first.state.spent)
+    found = _draw(rest, _search(rest, context), reasons)
+    plain = tuple(a + b for a, b in zip(found.plain or (0, 0, 0), state.plain, strict=True))
+    history = *state.history, *found.history
+    return found._replace(episodes=found.episodes + state.spent, history=history, plain=plain)
 
 
 def _search(request, context):
@@ -141,16 +160,10 @@ def _search(request, context):
 
 def _families(request):
     """The searches, in the order in which they are tried."""
-    few, s = (), request.settings
-    if transform.dimension(request.sim) >= s.moments_numbers and request.near is None:
-        if request.budget < s.moments_alone_budget:
-            return (_search_moments,)
-        few = (_search_moments,) if request.budget <= s.moments_budget else ()
     if _has_many_steps(request):
-        both = _search_tilts, _search_gaussians
-        return *few, *both[: 1 if request.otherwise else 2]
+        return (_search_tilts, _search_gaussians)[: 1 if request.otherwise else 2]
     near = (_search_tilts,) if isinstance(request.near, Tilts) else ()
-    return *few, *near, _search_gaussians, _search_mixed_tilts
+    return *near, _search_gaussians, _search_mixed_tilts
 
 
 def _has_many_steps(request):
@@ -159,11 +172,11 @@ def _has_many_steps(request):
     return about.choices or about.choices0 or horizon >= request.settings.tilts_first_horizon
 
 
-def _search_moments(request, context, state):
+def _search_moments(request, context):
     """The `Search` for Gaussians beyond the boundary of each moment, from few runs."""
     f = GaussianFamily(request.sim, request.budget, context, FEW_RUNS, "moments")
     gradients = request.gradients and not runs_on_host(request.sim)
-    return Search(f, explore_moments(f, state, request.failure_points, gradients))
+    return Search(f, explore_moments(f, request.failure_points, gradients))
 
 
 def _search_gaussians(request, context, state):

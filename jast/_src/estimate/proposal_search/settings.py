@@ -12,7 +12,7 @@ class SearchSettings(NamedTuple):
 
     # which family is tried
     moments_budget: int = 20_000
-    """Evaluations up to which half-spaces of the moments of an episode come first."""
+    """Evaluations up to which half-spaces of the moments of an episode are tried first."""
     moments_alone_budget: int = 5000
     """Evaluations below which nothing else is worth a try."""
     moments_numbers: int = 21
@@ -199,8 +199,9 @@ class SearchSettings(NamedTuple):
 
 SETTINGS = SearchSettings()
 FEW_RUNS = SETTINGS._replace(
+    exploration_end=0.35,
     audits=2,
-    audit_share=0.35,
+    audit_share=0.45,
     audit_population_least=20,
     tolerated_mass=0.1,
 )
