@@ -36,7 +36,12 @@ if TYPE_CHECKING:
     from jast._src.core.simulator import Simulator
     from jast._src.core.typing import Callback, Executor, PathLike
 
-__all__ = ["MIN_BUDGET", "adaptive_cross_entropy", "failure_probability"]
+__all__ = [
+    "MAX_SURROGATE_NUMBERS",
+    "MIN_BUDGET",
+    "adaptive_cross_entropy",
+    "failure_probability",
+]
 
 MIN_BUDGET = 5000
 """Episodes below which a surrogate answers."""

@@ -18,8 +18,11 @@ from jast._src.core.rewards import likelihood
 from jast._src.core.simulator import Simulator, require_simulator
 from jast._src.estimate import budgets
 from jast._src.estimate.budgets import MIN_POPULATION_BUDGET
+from jast._src.estimate.failure_probability import (
+    MAX_SURROGATE_NUMBERS,
+    failure_probability,
+)
 from jast._src.estimate.failure_probability import MIN_BUDGET as MIN_ESTIMATE_BUDGET
-from jast._src.estimate.failure_probability import failure_probability
 from jast._src.estimate.few_calls import few_calls
 from jast._src.estimate.monte_carlo import monte_carlo
 from jast._src.estimate.population.descents import SETTINGS, cool_failures
@@ -58,8 +61,6 @@ MIN_BUDGET = 300
 """Evaluations of a call, at least: with fewer no explorer is worth a call."""
 DEFAULT_BUDGET = 200_000
 """Evaluations by default where populations are not the answer."""
-MAX_SURROGATE_NUMBERS = 20
-"""Numbers of an episode up to which a surrogate tells the probability."""
 REDRAWN_EPISODES = 400
 """Draws of the estimate's proposal, where only it found failures."""
 MIN_COUNTED_EPISODES = 100
@@ -110,6 +111,8 @@ LARGE_SHARES = BudgetShares(nominal=0.05, search=0.15, slow_search=0.14, refine=
 """Where the estimate finds its own proposal."""
 SURROGATE_SHARES = BudgetShares(nominal=0.05, search=0.3, slow_search=0, refine=0.35)
 """Where a surrogate tells the probability with few evaluations."""
+MOMENTS_SHARES = BudgetShares(nominal=0.05, search=0.2, slow_search=0, refine=0.2)
+"""Where the moments of an episode of many numbers tell it with few evaluations."""
 COUNTING_SHARES = BudgetShares(nominal=0.125, search=0.35, slow_search=0.2, refine=0.325)
 """Where only plain draws tell it."""
 
@@ -149,8 +152,7 @@ def stress(
             33,554,432; 200,000 of others. Where only the standard error of the probability makes it
             UNRELIABLE, and 4,194,304 would do, everything is done again with these (but not with a
             ``checkpoint``). The report's ``settings`` name the one that was used.
-            Below 10,417 the probability is a surrogate's (`failure_probability` with few calls),
-            and with more than 20 numbers an episode that of the plain draws alone.
+            Below 10,417 the probability is that of `failure_probability` with few calls.
         seconds: in place of ``budget``: as many evaluations as the system simulates in so many CPU
             seconds (a black box: seconds), rounded down to 2^k or 3 2^k.
         top: failures kept, at least one for each mode.
@@ -240,12 +242,12 @@ class _StressTest:
         self.residual = self.late = np.nan
         self.has_points = has_quantiles(sim)
         large = (1 - sum(LARGE_SHARES)) * budget >= MIN_ESTIMATE_BUDGET
-        few_numbers = self.has_points and transform.dimension(sim) <= MAX_SURROGATE_NUMBERS
-        self.estimable = self.has_points and (large or few_numbers)
         self.cheap = self.has_points and budgets.uses_populations(sim, budget)
         shares = COUNTING_SHARES
-        if self.estimable:
-            shares = LARGE_SHARES if large else SURROGATE_SHARES
+        if self.has_points:
+            many_numbers = transform.dimension(sim) > MAX_SURROGATE_NUMBERS
+            few = MOMENTS_SHARES if many_numbers else SURROGATE_SHARES
+            shares = LARGE_SHARES if large else few
         # what populations do not answer gains little from more
         self.parts = BudgetShares(*(int(share * min(budget, DEFAULT_BUDGET)) for share in shares))
         self.modes_budget = int(MODES_SHARE * budget)
@@ -416,7 +418,7 @@ class _StressTest:
         rest = max(self.budget - self.spent, 1)
         folder = None if self.checkpoint is None else Path(self.checkpoint) / "probability"
         places = dict(executor=self.ways.executor, devices=self.ways.devices, checkpoint=folder)
-        if not self.estimable:
+        if not self.has_points:
             n = max(rest, MIN_COUNTED_EPISODES)
             p = monte_carlo(self.next_key(), self.sim, n, **places)
             return self.keep_probability(p, "plain draws")
