@@ -1,0 +1,200 @@
+"""Half-spaces of failure, and the mixtures of Gaussians that draw from them.
+
+The probability of half-spaces is a sum that counts some failures twice; draws of a mixture of the
+model within each, weighed by all of it, count them once (importance sampling of a union of rare
+events: Owen, Maximov and Chertkov 2019; of several design points: Au and Beck 2001). Here each is a
+Gaussian of the model's mean and variance beyond its plane, with a wide copy, and weighted failures
+tell by how much those of a system that is not linear are spread more widely.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from jast._src.estimate.gaussians.mixture_fit import (
+    Gaussians,
+    as_latent,
+    effective_sample_size,
+    most_components,
+    unit_gaussians,
+)
+from jast._src.estimate.proposal_search.settings import SETTINGS
+from jast._src.normal_space.moments import Linearised
+from jast._src.normal_space.transform import Latent
+
+__all__ = [
+    "Layers",
+    "Planes",
+    "first_layers",
+    "fit_layers",
+    "layers_as_latent",
+    "merge_planes",
+    "no_planes",
+    "planes_of",
+    "that_matter",
+]
+
+LITTLE = 1e-3
+"""Part of the greatest probability of a half-space, below which one is left out."""
+SAME = 0.9
+"""Cosine above which two half-spaces of a moment are one."""
+ALIKE = 0.97
+"""Cosine above which the less likely of two is left out."""
+MOST = 64
+"""Half-spaces of a proposal at most: densities take their number times that of the numbers
+squared."""
+SPREAD = 2.0
+"""Factor on the variance beyond a plane: with it, and a fifth of wide copies, .45 effective draws a
+draw where the plane is right, .2 where the boundary is .3 standard deviations nearer (one
+dimension, 4.2 standard deviations out, by quadrature; with a factor of 1: .54 and .12)."""
+WIDE_SHARE = 0.3
+"""Share of the wide copies."""
+WIDE_NEARER = 0.5
+"""How much nearer than its plane a wide copy lies."""
+PRIOR = 20.0
+"""Failures that half-spaces as they were found count for beside those that were drawn."""
+ITERATIONS = 20
+"""Of expectation maximisation."""
+
+
+class Planes(NamedTuple):
+    """Half-spaces of failure, normal . z >= depth, [K] each."""
+
+    normal: np.ndarray
+    """[K, D] of norm 1"""
+    depth: np.ndarray
+    moment: np.ndarray
+    rate: np.ndarray
+    """How much nearer to failing a standard deviation brings"""
+    gap: np.ndarray
+    """From where it was linearised to its nearest failing point"""
+
+    def take(self, rows: np.ndarray) -> Planes:
+        """Some of them."""
+        return Planes(*(a[rows] for a in self))
+
+    @property
+    def log_mass(self) -> np.ndarray:
+        """[K] logs of their probabilities."""
+        from scipy.special import log_ndtr  # here: slow to import
+
+        return log_ndtr(-self.depth)
+
+    @property
+    def nearest(self) -> np.ndarray:
+        """[K, D] their design points."""
+        return self.depth[:, None] * self.normal
+
+
+class Layers(NamedTuple):
+    """Gaussians beyond K half-spaces, a narrow one and a wide one each, [2, K]."""
+
+    share: np.ndarray
+    mean: np.ndarray
+    """Along the normal of a plane; the others are the model's"""
+    variance: np.ndarray
+
+
+def no_planes(d: int) -> Planes:
+    """None of ``d`` numbers."""
+    return Planes(np.zeros((0, d)), np.zeros(0), np.zeros(0, int), np.zeros(0), np.zeros(0))
+
+
+def planes_of(here: Linearised) -> Planes:
+    """The half-spaces of the moments that a slope leads to failure from."""
+    size = np.linalg.norm(here.slope, axis=1)
+    moment = np.flatnonzero((size > 0) & (here.distance > 0))
+    normal = -here.slope[moment] / size[moment, None]
+    beyond = here.distance[moment] / size[moment]
+    depth = normal @ here.point + beyond
+    gap = np.linalg.norm(depth[:, None] * normal - here.point, axis=1)
+    return Planes(normal, depth, moment, size[moment], gap).take(depth > 0)
+
+
+def merge_planes(old: Planes, new: Planes) -> Planes:
+    """Both; of two of one moment and side the one that was linearised nearer to its boundary."""
+    both = Planes(*map(np.concatenate, zip(old, new, strict=True)))
+    order = np.argsort(both.gap, kind="stable")
+    kept: list[int] = []
+    for i in order:
+        same = [j for j in kept if both.moment[j] == both.moment[i]]
+        if not same or (both.normal[same] @ both.normal[i]).max() < SAME:
+            kept.append(i)
+    return both.take(np.sort(kept))
+
+
+def that_matter(planes: Planes, d: int) -> Planes:
+    """Those of great probability that differ from one another, as many as a proposal is to hold
+    with their wide copies.
+    """
+    mass = planes.log_mass
+    order = np.argsort(-mass, kind="stable")
+    order = order[mass[order] > mass.max() + math.log(LITTLE)]
+    most, kept = min(most_components(d) // 2, MOST), []
+    for i in order:
+        if len(kept) < most and (planes.normal[kept] @ planes.normal[i]).max(initial=-1) < ALIKE:
+            kept.append(i)
+    return planes.take(kept)
+
+
+def first_layers(planes: Planes) -> Layers:
+    """The model beyond each of the ``planes``, narrow and wide."""
+    mass = planes.log_mass
+    # mean and variance of a standard normal number beyond the depth
+    mean = np.exp(-0.5 * planes.depth**2 - 0.5 * math.log(2 * math.pi) - mass)
+    variance = SPREAD * (1 - mean * (mean - planes.depth))
+    shares = np.exp(mass - mass.max())
+    return Layers(
+        np.outer([1 - WIDE_SHARE, WIDE_SHARE], shares / shares.sum()),
+        np.stack([mean, planes.depth - WIDE_NEARER]),
+        np.stack([variance, np.maximum(variance, 1.0)]),
+    )
+
+
+def layers_as_latent(planes: Planes, layers: Layers, dtype: Any) -> Latent:
+    """The `Latent` of two ``layers`` of Gaussians beyond each of the ``planes``."""
+    k, d = planes.normal.shape
+    # the reflection that takes the first axis to the normal
+    way = planes.normal - np.eye(d)[0]
+    size = np.maximum((way**2).sum(axis=1), 1e-12)
+    vectors = np.eye(d) - 2 * way[:, :, None] * way[:, None] / size[:, None, None]
+    parts = []
+    for share, mean, variance in zip(*layers, strict=True):
+        values = np.ones((k, d))
+        values[:, 0] = variance
+        means = mean[:, None] * planes.normal
+        parts.append((share.sum(), Gaussians(share / share.sum(), means, values, vectors)))
+    if planes.log_mass.max() > math.log(SETTINGS.rare_probability):
+        parts.append((SETTINGS.model_share, unit_gaussians(np.zeros((1, d)))))
+    return as_latent(parts, dtype)
+
+
+def fit_layers(z: np.ndarray, log_weight: np.ndarray, planes: Planes, first: Layers) -> Layers:
+    """Layers fitted to weighted failures ``z`` [n, D] by expectation maximisation: the shares, and
+    for all planes together by how much each layer is wider than the ``first``, and nearer.
+    """
+    x = (z.astype(np.float64) @ planes.normal.T)[:, None]  # [n, 1, K]
+    w = np.exp(log_weight - log_weight.max())
+    w *= effective_sample_size(log_weight) / w.sum()
+    layers = first
+    for _ in range(ITERATIONS):
+        share, mean, variance = layers
+        joint = np.log(share) - 0.5 * (x - mean) ** 2 / variance - 0.5 * np.log(variance)
+        joint += 0.5 * x**2
+        part = np.exp(joint - joint.max(axis=(1, 2), keepdims=True))
+        part *= w[:, None, None] / part.sum(axis=(1, 2), keepdims=True)
+        n = part.sum(axis=(0, 2)) + PRIOR  # of each layer
+        nearer = np.minimum((part * (x - first.mean)).sum(axis=(0, 2)) / n, 0.0)[:, None]
+        spread = (part * (x - first.mean - nearer) ** 2).sum(axis=(0, 2)) / n
+        share = part.sum(axis=0) + PRIOR * first.share
+        share /= share.sum(axis=1, keepdims=True)
+        wide = max(n[1] / n.sum(), WIDE_SHARE)
+        layers = Layers(
+            np.array([[1 - wide], [wide]]) * share,
+            first.mean + nearer,
+            np.maximum(first.variance, spread[:, None]),
+        )
+    return layers

@@ -1,0 +1,155 @@
+"""Few runs of many numbers: the half-spaces of each moment of an episode against closed forms and
+NumPy, and the answers that they lead to.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.stats import norm
+
+import jast
+from benchmarks.few_calls import SlowLane, plane, slow_lane
+from benchmarks.first_minute import lane
+from jast._src.estimate.gaussians import half_spaces
+from jast._src.normal_space.moments import distances, slopes
+from jast.estimate import failure_probability
+from jast.simulators import limit_state
+
+BOUND, STEPS = 1.4, 30
+
+
+def offsets(z):
+    """The lane of the README in NumPy: offsets [n, steps] for gusts ``z`` [n, steps]."""
+    offset = speed = np.zeros(len(z))
+    out = []
+    for gust in z.T:
+        speed = 0.8 * speed - 0.3 * offset + 0.1 * gust
+        offset = offset + speed
+        out.append(offset)
+    return np.stack(out, axis=1)
+
+
+def probability_of_lane(draws=200_000):
+    """(P, standard error) that the lane fails, by the importance sampling of Owen, Maximov and
+    Chertkov (2019): its offsets are linear in the gusts.
+    """
+    rng = np.random.default_rng(0)
+    response = offsets(np.eye(STEPS)).T  # [moment, gust]
+    size = np.linalg.norm(response, axis=1)
+    normals = np.concatenate([response, -response]) / np.tile(size, 2)[:, None]
+    depth = BOUND / np.tile(size, 2)
+    mass = norm.sf(depth)
+    chosen = rng.choice(len(mass), draws, p=mass / mass.sum())
+    z = rng.standard_normal((draws, STEPS))
+    beyond = norm.isf(rng.random(draws) * mass[chosen])
+    along = (z * normals[chosen]).sum(axis=1)
+    z += (beyond - along)[:, None] * normals[chosen]
+    count = (z @ normals.T >= depth - 1e-9).sum(axis=1)
+    weight = mass.sum() / count
+    return weight.mean(), weight.std() / draws**0.5
+
+
+def test_distances_at_each_moment_are_those_of_numpy(dtype):
+    z = np.random.default_rng(1).standard_normal((40, STEPS)).astype(dtype)
+    z[:5] *= 5  # these fail
+    o, g = distances(lane(), z)
+    y = np.abs(offsets(z.astype(float)))
+    assert g.shape == (40, STEPS + 1) and g[0, 0] == pytest.approx(BOUND)
+    out = np.maximum.accumulate(y, axis=1) >= BOUND
+    assert out[:5, -1].all() and (np.asarray(o.failure) == out[:, -1]).all()
+    assert (np.isnan(g[:, 1:]) == out).all()
+    np.testing.assert_allclose(g[:, 1:][~out], (BOUND - y)[~out], atol=1e-5)
+
+
+def test_slopes_are_the_responses_to_each_gust(dtype):
+    point = np.random.default_rng(2).standard_normal(STEPS).astype(dtype)
+    y = offsets(point[None].astype(float))[0]
+    assert np.abs(y).max() < BOUND
+    here = slopes(lane(), point, gradients=True)
+    sure = np.abs(y) > 0.1  # the others may change sides within a step
+    expected = -np.sign(y)[:, None] * offsets(np.eye(STEPS)).T
+    tolerance = 1e-4 if dtype == np.float32 else 1e-9
+    np.testing.assert_allclose(here.slope[1:][sure], expected[sure], atol=tolerance)
+    assert sure.sum() > STEPS / 2
+
+
+def test_a_gradient_is_that_of_the_differences(dtype):
+    point = np.full(100, 0.1).astype(dtype)
+    by_gradient = slopes(plane(100), point, gradients=True)
+    by_differences = slopes(plane(100), point, gradients=False)
+    for here in (by_gradient, by_differences):
+        np.testing.assert_allclose(here.slope, np.full((1, 100), -0.1), atol=1e-4)
+        assert here.distance == pytest.approx(3.5 - 1.0, abs=1e-4)
+
+
+def test_the_lane_is_answered_with_two_thousand_runs(dtype):
+    truth, error = probability_of_lane()
+    assert truth == pytest.approx(5.138e-5, rel=0.01) and error < 0.005 * truth
+    p = failure_probability(jax.random.key(3), lane(), 2000)
+    assert p.reliable and p.evaluations == 2000
+    assert abs(p.mean - truth) < 4 * p.standard_error < 0.4 * truth
+
+
+def test_a_black_box_runs_as_often_as_it_says():
+    SlowLane.runs = 0
+    p = failure_probability(jax.random.key(0), slow_lane(), 1500)
+    assert SlowLane.runs == p.evaluations == 1500
+    assert p.reliable and abs(p.mean / 5.138e-5 - 1) < 4 * p.relative_error < 0.5
+
+
+@pytest.mark.parametrize("gradients", [True, False])
+def test_a_plane_of_a_hundred_numbers(gradients):
+    p = failure_probability(jax.random.key(1), plane(100), 1200, gradients=gradients)
+    assert p.reliable and abs(p.mean / norm.sf(3.5) - 1) < 4 * p.relative_error < 0.25
+
+
+def _one_of_two(z):
+    """Fails beyond either of two planes that stand square on one another."""
+    return jnp.minimum(3.6 - z[0], 3.8 - jnp.sum(z[1:17]) / 4)
+
+
+def _either_side(z):
+    return 3.7 - jnp.abs(jnp.sum(z[:25]) / 5 + 0.2)
+
+
+@pytest.mark.parametrize(
+    "g, truth",
+    [
+        (_one_of_two, 1 - norm.cdf(3.6) * norm.cdf(3.8)),
+        (_either_side, norm.sf(3.5) + norm.sf(3.9)),
+    ],
+)
+def test_two_half_spaces_are_both_found_or_missed_aloud(g, truth):
+    p = failure_probability(jax.random.key(0), limit_state(g, 40), 3000)
+    assert not p.reliable or abs(p.mean / truth - 1) < max(4 * p.relative_error, 0.1)
+
+
+def test_where_no_slope_leads_plain_draws_answer():
+    p = failure_probability(jax.random.key(0), limit_state(lambda z: 3.0 + 0 * z[0], 30), 400)
+    assert not p.reliable and np.isnan(p.mean) and p.evaluations == 400
+    assert p.plain == (0, 0, 400) and "no failure in" in p.warnings[0]
+    often = failure_probability(jax.random.key(0), limit_state(lambda z: -z[0], 30), 1000)
+    assert often.reliable and abs(often.mean - 0.5) < 4 * often.standard_error
+
+
+def test_stress_tells_the_probability_of_the_lane_from_two_thousand_runs():
+    report = jast.stress(jax.random.key(1), lane(), 2000)
+    p = report.probability
+    assert report.episodes <= 2000
+    assert p.reliable and abs(p.mean / 5.138e-5 - 1) < 4 * p.relative_error < 0.6
+
+
+def test_layers_that_failures_lie_before_come_nearer_and_others_stay():
+    """Failures drawn a standard deviation before the plane, and beyond it."""
+    one = np.ones(1)
+    planes = half_spaces.Planes(np.eye(3)[:1], 4 * one, np.zeros(1, int), one, one)
+    first = half_spaces.first_layers(planes)
+    z = np.random.default_rng(0).standard_normal((300, 3))
+    for at, nearer in ((3.0, True), (4.22, False)):
+        z[:, 0] = at + 0.1 * z[:, 0]
+        layers = half_spaces.fit_layers(z, np.zeros(300), planes, first)
+        moved = (layers.mean - first.mean).min()
+        assert (moved < -0.3) == nearer
+        assert (layers.variance >= first.variance - 1e-12).all()
+        assert layers.share.sum() == pytest.approx(1)
