@@ -69,7 +69,7 @@ def test_slopes_are_the_responses_to_each_gust(dtype):
     here = slopes(lane(), point, gradients=True)
     sure = np.abs(y) > 0.1  # the others may change sides within a step
     expected = -np.sign(y)[:, None] * offsets(np.eye(STEPS)).T
-    tolerance = 1e-4 if dtype == np.float32 else 1e-9
+    tolerance = 100 * float(jnp.finfo(dtype).eps)  # of a difference of distances over a tenth
     np.testing.assert_allclose(here.slope[1:][sure], expected[sure], atol=tolerance)
     assert sure.sum() > STEPS / 2
 
@@ -85,7 +85,7 @@ def test_a_gradient_is_that_of_the_differences(dtype):
 
 def test_the_lane_is_answered_with_two_thousand_runs(dtype):
     truth, error = probability_of_lane()
-    assert truth == pytest.approx(5.138e-5, rel=0.01) and error < 0.005 * truth
+    assert truth == pytest.approx(5.0355e-5, rel=0.01) and error < 0.005 * truth
     p = failure_probability(jax.random.key(3), lane(), 2000)
     assert p.reliable and p.evaluations == 2000
     assert abs(p.mean - truth) < 4 * p.standard_error < 0.4 * truth
@@ -95,7 +95,7 @@ def test_a_black_box_runs_as_often_as_it_says():
     SlowLane.runs = 0
     p = failure_probability(jax.random.key(0), slow_lane(), 1500)
     assert SlowLane.runs == p.evaluations == 1500
-    assert p.reliable and abs(p.mean / 5.138e-5 - 1) < 4 * p.relative_error < 0.5
+    assert p.reliable and abs(p.mean / 5.0355e-5 - 1) < 4 * p.relative_error < 0.5
 
 
 @pytest.mark.parametrize("gradients", [True, False])
@@ -128,7 +128,7 @@ def test_two_half_spaces_are_both_found_or_missed_aloud(g, truth):
 def test_where_no_slope_leads_plain_draws_answer():
     p = failure_probability(jax.random.key(0), limit_state(lambda z: 3.0 + 0 * z[0], 30), 400)
     assert not p.reliable and np.isnan(p.mean) and p.evaluations == 400
-    assert p.plain == (0, 0, 400) and "no failure in" in p.warnings[0]
+    assert p.plain == (0, 0, p.samples) and "no failure in" in p.warnings[0]
     often = failure_probability(jax.random.key(0), limit_state(lambda z: -z[0], 30), 1000)
     assert often.reliable and abs(often.mean - 0.5) < 4 * often.standard_error
 
@@ -137,7 +137,7 @@ def test_stress_tells_the_probability_of_the_lane_from_two_thousand_runs():
     report = jast.stress(jax.random.key(1), lane(), 2000)
     p = report.probability
     assert report.episodes <= 2000
-    assert p.reliable and abs(p.mean / 5.138e-5 - 1) < 4 * p.relative_error < 0.6
+    assert p.reliable and abs(p.mean / 5.0355e-5 - 1) < 4 * p.relative_error < 0.6
 
 
 def test_layers_that_failures_lie_before_come_nearer_and_others_stay():

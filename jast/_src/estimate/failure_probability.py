@@ -44,7 +44,7 @@ __all__ = [
 ]
 
 MIN_BUDGET = 5000
-"""Episodes below which a surrogate answers."""
+"""Episodes below which a surrogate answers, or the moments of an episode alone."""
 MAX_SURROGATE_NUMBERS = 20
 """Numbers of an episode up to which it does."""
 LEVELS = 20
@@ -104,10 +104,20 @@ def failure_probability(
     failures are. The others, drawn at random, correct it: the interval comes from these, and holds
     the surrogate's error. Batches of calls suit black boxes with workers. The estimate is
     UNRELIABLE if one call changes much, the relative standard error is above 25 %, or there are
-    fewer than 10 failures; if there are none, draws of the model give an upper bound. Above some 20
-    numbers an episode it mostly ends so. The method itself takes some 4 CPU seconds for 200 calls,
+    fewer than 10 failures; if there are none, draws of the model give an upper bound. The method
+    itself takes some 4 CPU seconds for 200 calls,
     more where NumPy's threads wait for one another (OPENBLAS_NUM_THREADS=1); their number changes
     what is drawn.
+
+    Of episodes of more than 20 numbers, calls with at most 10,000 episodes first ask each moment. A
+    simulator says at every state how far it is from failing, so that one run tells as many limit
+    states as it has moments. The system is linearised next to the boundary that is nearest, by one
+    run for each number, or by gradients where it is judged at its end alone. Each moment then has a
+    half-space of failure, whose depth a run or two correct and whose mirror image is tried. The
+    proposal draws beyond these half-spaces, nearer where the failures of three batches lie nearer.
+    The audit is a small one: it finds modes of a tenth of the probability or more. Where such
+    proposals do not serve, the other searches have what is left, from 5000 episodes on; below,
+    plain draws or subset simulation answer, UNRELIABLE.
 
     A failure mode below ``unseen`` that all explorers miss is missing without a sign. A
     KeyboardInterrupt during the last part ends it with the estimate of the draws so far; before
