@@ -42,7 +42,7 @@ KNOWN = 0.15
 """Standard deviations to which the nearest boundary must be where its plane says: a probability at
 four of them is then known to a factor of two, and the draws tell the rest."""
 ROUNDS = 6
-"""Linearisations from one start at most."""
+"""Linearisations from one start at most; what is linear or nearly so took 2 to 4."""
 GIVEN = 4
 """Failures that came with the call, and that no plane explains, from which others start."""
 ROOTS = 3
@@ -50,7 +50,7 @@ ROOTS = 3
 FARTHER = 2.0
 """Standard deviations at most that one of them goes on."""
 BATCHES = 3
-"""Batches that a proposal is fitted to."""
+"""Batches that a proposal is fitted to, of a twenty-fifth of the budget each."""
 
 
 def explore_moments(f: GaussianFamily, given: np.ndarray | None, gradients: bool) -> SearchState:
