@@ -116,8 +116,8 @@ def failure_probability(
     half-space of failure, whose depth a run or two correct and whose mirror image is tried. The
     proposal draws beyond these half-spaces, nearer where the failures of three batches lie nearer.
     The audit is a small one: it finds modes of a tenth of the probability or more. Where such
-    proposals do not serve, the other searches have what is left, from 5000 episodes on; below,
-    plain draws or subset simulation answer, UNRELIABLE.
+    proposals do not serve, the other searches have what is left, if that is 5000 episodes or more;
+    else plain draws or subset simulation answer, and mostly UNRELIABLE.
 
     A failure mode below ``unseen`` that all explorers miss is missing without a sign. A
     KeyboardInterrupt during the last part ends it with the estimate of the draws so far; before

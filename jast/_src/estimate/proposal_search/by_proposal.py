@@ -127,9 +127,9 @@ def _answer(request, context, reasons):
         return _draw(request, _search(request, context), reasons)
     first = _search_moments(request, context)
     serves = first.suffices and is_efficient(first.state, s.family_efficiency)
-    if serves or request.budget < s.moments_alone_budget:
-        return _draw(request, _audit(first) if serves else first, reasons)
     state, rest = first.state, request._replace(budget=request.budget - first.state.spent)
+    if serves or rest.budget < s.moments_alone_budget:
+        return _draw(request, _audit(first) if serves else first, reasons)
     found = _draw(rest, _search(rest, context), reasons)
     plain = tuple(a + b for a, b in zip(found.plain or (0, 0, 0), state.plain, strict=True))
     history = *state.history, *found.history
