@@ -37,7 +37,7 @@ from jast.distributions import (
 from jast.estimate import failure_probability
 from jast.simulators import limit_state
 
-__all__ = ["SYSTEMS", "System", "metaballs"]
+__all__ = ["SYSTEMS", "SlowLane", "System", "metaballs", "plane", "slow_lane"]
 
 
 class System(NamedTuple):
@@ -230,7 +230,7 @@ def report_of(system: System, seeds: int, budget: int | None) -> dict:
     good = [r.mean / system.truth - 1 for r in runs if r.reliable]
     calls = budget or system.budget
     return report | {
-        "rms_unflagged": float(np.sqrt(np.mean(np.square(good)))) if good else math.nan,
+        "rms_unflagged": float(np.sqrt(np.mean(np.square(good)))) if good else None,
         "plain": math.sqrt((1 - system.truth) / system.truth / calls),
         "runs_counted": SlowLane.runs / seeds,
         "budget": budget or system.budget,
@@ -255,9 +255,10 @@ def main(argv: list[str] | None = None) -> None:
     )
     for name in args.systems or size(args, list(SYSTEMS), QUICK, ["hyperplane 10"]):
         report[name] = r = report_of(SYSTEMS[name], seeds, budget)
+        reliable = f"{100 * r['rms_unflagged']:8.1f} %" if r["rms_unflagged"] else f"{'-':>10}"
         counted = f"{r['runs_counted']:12.0f}" if r["runs_counted"] else ""
         say(
-            f"{name:18}{r['budget']:5d}{100 * r['rms']:8.1f} %{100 * r['rms_unflagged']:8.1f} %"
+            f"{name:18}{r['budget']:5d}{100 * r['rms']:8.1f} %{reliable}"
             f"{r['within_10']:8d} of {seeds:<2d}{r['covers']:7d}{r['flagged']:9d}"
             f"{r['far_unflagged']:8d}{100 * r['plain']:11.0f} %{r['cpu_s']:8.1f}"
             f" ({r['cpu_s_first']:.1f}){r['wall_s']:10.1f}{counted}"
