@@ -11,12 +11,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jast._src.blackbox.worker import fill, history
+from jast._src.blackbox.answers import Answer, Answers, keys_of
+from jast._src.blackbox.worker import fill
 from jast._src.runtime.host_errors import Log
 
 __all__ = ["Calls", "Host"]
-
-REMEMBERED = 1 << 16  # outcomes kept to be compared with, of failures and of others each: some MB
 
 
 class Calls(NamedTuple):
@@ -43,6 +42,8 @@ class Calls(NamedTuple):
     """Disturbances applied, those of repeated histories included"""
     seconds: float
     """Wall time of the host calls"""
+    known: int = 0
+    """Of the rows, those that were answered before: nothing was run for them"""
 
     def __str__(self) -> str:
         each = self.seconds / max(self.rows, 1) * 1e3
@@ -55,18 +56,22 @@ class Calls(NamedTuple):
 class Host:
     """Answers the callbacks of one simulator, one at a time."""
 
-    def __init__(self, runner, spec, x, starts):
-        """``x``: the structure of a disturbance; ``starts``: how many leaves x0 has."""
-        self.runner, self.spec, self.x, self.starts = runner, spec, x, starts
+    def __init__(self, runner, spec, x, starts, size):
+        """``x``: the structure of a disturbance; ``starts``: how many leaves x0 has; ``size``: how
+        many numbers are observed.
+        """
+        self.runner, self.spec, self.x, self.starts, self.size = runner, spec, x, starts, size
         self.log = Log()
         self.done = Calls(0, 0, 0, 0, 0.0)
-        self.failing, self.others = {}, {}
+        self.answers = Answers(size)
+        self.asked_twice: set[bool] = set()  # whether a failure was, and another one
+        self.differs = False  # the system answered the same history in two ways
         self.lock = threading.Lock()
         # one callable for each kind of answer, as it is part of what a compiled program is known by
         self.callback = cache(lambda dtype, size: partial(self, dtype, size))
 
     def __reduce__(self):  # another process counts for itself
-        return Host, (self.runner, self.spec, self.x, self.starts)
+        return Host, (self.runner, self.spec, self.x, self.starts, self.size)
 
     def incidents(self):
         return self.log.all()
@@ -124,12 +129,60 @@ class Host:
         return int(np.sum(on_the_way & ~at_the_end))
 
     def _answer(self, lanes, t, x0, xs, dtype):
+        """Outcomes of rows: of those that were not answered before, and of a few others
+        (`_in_doubt`), the system is asked, once each.
+        """
+        keys = keys_of(x0, xs, t)
+        rows = self._to_run(keys, t)
+        if len(rows):
+            answers = self._run(keys, rows, lanes, t, x0, xs, dtype)
+        else:
+            answers = {}
+        self.done = self.done._replace(
+            rows=self.done.rows + len(t), known=self.done.known + len(t) - len(rows)
+        )
+        found = [answers.get(i) or answers.get(k) or self.answers.get(k) for i, k in enumerate(keys)]
+        with np.errstate(over="ignore"):
+            distance, log_p = (
+                np.array([getattr(a, name) for a in found]).astype(dtype)
+                for name in ("distance", "log_p")
+            )
+        event, terminal = (
+            np.array([getattr(a, name) for a in found], bool) for name in ("event", "terminal")
+        )
+        seen = np.frombuffer(b"".join(a.seen for a in found), np.float64).reshape(len(t), self.size).astype(dtype)
+        wrong = ~np.isfinite(distance)  # too large for the dtype, too
+        distance[wrong], log_p[wrong] = np.nan, 0
+        return event & ~wrong, distance, terminal | wrong, log_p, seen
+
+    def _to_run(self, keys, t):
+        """The rows [m] of which the system is asked."""
+        if self.differs:
+            return np.arange(len(keys))
+        first, twice = {}, []
+        for i, key in enumerate(keys):
+            before = self.answers.get(key)
+            if before is None:
+                first.setdefault(key, i)
+            elif self._in_doubt(before, t[i]):
+                self.asked_twice.add(before.event)
+                twice.append(i)
+        return np.array(sorted([*first.values(), *twice]), int)
+
+    def _in_doubt(self, before, t):
+        """Whether a row with this answer is run once more, to see whether it is answered the same:
+        the first failure that is asked for again is, and the first other one.
+        """
+        return t > 0 and before.event not in self.asked_twice and np.isfinite(before.distance)
+
+    def _run(self, keys, rows, lanes, t, x0, xs, dtype):
+        """The `Answer` of each of ``rows`` by its number and its key, which are kept."""
+        t, lanes = t[rows], lanes[rows]
+        x0, xs = [a[rows] for a in x0], [a[rows] for a in xs]
         reply = self.runner(t, x0, xs, lanes)
-        count = self.done
-        self.done = count._replace(
-            rows=count.rows + len(t),
-            episodes=count.episodes + reply.episodes,
-            transitions=count.transitions + reply.transitions,
+        self.done = self.done._replace(
+            episodes=self.done.episodes + reply.episodes,
+            transitions=self.done.transitions + reply.transitions,
         )
 
         def example(i):
@@ -138,37 +191,44 @@ class Host:
                 fill(self.x, [a[i, : t[i]] for a in xs]),
             )
 
-        wrong = np.zeros(len(t), bool)
+        said = {}
         for i, kind, message in reply.problems:
-            wrong[i] = True
-            self.log.add(kind, message, partial(example, i))
+            said[i] = kind, message
         with np.errstate(over="ignore"):
-            distance = reply.distance.astype(dtype)
-            log_p = reply.log_p.astype(dtype)
-            seen = reply.seen.astype(dtype)
-        for i in np.flatnonzero(~np.isfinite(distance) & ~wrong):
-            wrong[i] = True
-            said = f"distance is {reply.distance[i]:g}, too large for {np.dtype(dtype).name}"
-            self.log.add("NaN", said, partial(example, i))
-        event, terminal = reply.event & ~wrong, reply.terminal | wrong
-        distance[wrong], log_p[wrong] = np.nan, 0
-        for i in np.flatnonzero(~wrong):
-            key = hash(history([a[i] for a in x0], [a[i] for a in xs], int(t[i])))
-            outcome = bool(event[i]), float(reply.distance[i]), float(reply.log_p[i])
-            self._compare(key, outcome, partial(example, i))
-        return event, distance, terminal, log_p, seen
+            large = ~np.isfinite(reply.distance.astype(dtype))
+        for i in np.flatnonzero(large):
+            said.setdefault(
+                i,
+                ("NaN", f"distance is {reply.distance[i]:g}, too large for {np.dtype(dtype).name}"),
+            )
+        for i, (kind, message) in sorted(said.items()):
+            self.log.add(kind, message, partial(example, i))
+        found = {}
+        for i, row in enumerate(rows.tolist()):
+            answer = Answer(
+                bool(reply.event[i]),
+                float(reply.distance[i]),
+                bool(reply.terminal[i]),
+                float(reply.log_p[i]),
+                reply.seen[i].tobytes(),
+            )
+            found[row] = found[keys[row]] = answer
+            before = self.answers.get(keys[row])
+            if before is None:
+                self.answers.put(keys[row], answer)
+            elif i not in said:
+                self._compare(before, answer, partial(example, i))
+        return found
 
-    def _compare(self, key, outcome, example):
-        """Remember an outcome (event, distance, log p); an incident where the same input had
-        another one before.
+    def _compare(self, before, now, example):
+        """An incident where the same input had another answer before; from then on nothing is
+        answered from memory.
         """
-        before = self.failing.get(key) or self.others.get(key)
-        if before is None:
-            outcomes = self.failing if outcome[0] else self.others
-            if len(outcomes) >= REMEMBERED:
-                del outcomes[next(iter(outcomes))]
-            outcomes[key] = outcome
-        elif before != outcome:
-            names = "a failure and no failure", "two distances", "two values of log p"
-            what = next(name for name, a, b in zip(names, before, outcome) if a != b)
+        if before.distance != now.distance or (before.event, before.log_p) != (now.event, now.log_p):
+            self.differs = True
+            what = "two values of log p"
+            if before.event != now.event:
+                what = "a failure and no failure"
+            elif before.distance != now.distance:
+                what = "two distances"
             self.log.add("not deterministic", f"the same disturbances gave {what}", example)

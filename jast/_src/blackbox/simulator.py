@@ -241,7 +241,7 @@ def from_python(
     like = D.event_like(disturbance) if constant else _shape(disturbance, blank, like)
     x = _structure("disturbance", like)
     runner.configure(x, size)
-    host = Host(runner, spec, x, len(jax.tree.leaves(like0)))
+    host = Host(runner, spec, x, len(jax.tree.leaves(like0)), size)
 
     def begin(x0):
         return blank(like)._replace(begun=jnp.ones((), bool), x0=x0)
