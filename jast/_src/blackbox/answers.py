@@ -4,6 +4,7 @@ JAX.
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Iterable
 from hashlib import blake2b
 from typing import NamedTuple
@@ -12,12 +13,14 @@ import numpy as np
 
 from jast._src.blackbox.worker import history
 
-__all__ = ["Answer", "Answers", "keys_of"]
+__all__ = ["Answer", "Answers", "Failing", "keys_of"]
 
 HELD = 2**26
 """Bytes that answers may take, those of failures and those of others each; then the oldest goes."""
 ENTRY = 350
 """Bytes of one answer in CPython, beside 8 for each observed number."""
+FAILURES = 4096
+"""Failing runs that are kept with their disturbances; then the oldest goes."""
 KEY = 16
 """Bytes that tell histories apart: two of 2^32 have the same ones with a chance of 3e-20."""
 
@@ -34,6 +37,15 @@ class Answer(NamedTuple):
     """float64: what ``observe`` returned."""
 
 
+class Failing(NamedTuple):
+    """A run that failed."""
+
+    x0: list[np.ndarray]
+    xs: list[np.ndarray]
+    """[horizon, ...]: the first ``t`` rows; zeros after them."""
+    t: int
+
+
 class Answers:
     """The answers to histories: a bounded memory that loses the oldest first, of failures last."""
 
@@ -42,6 +54,7 @@ class Answers:
         self.size, self.most = size, max(HELD // (ENTRY + 8 * size), 1)
         self.failing: dict[bytes, Answer] = {}
         self.others: dict[bytes, Answer] = {}
+        self.failures: deque[Failing] = deque(maxlen=FAILURES)
 
     def get(self, key: bytes) -> Answer | None:
         return self.failing.get(key) or self.others.get(key)

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jast._src.blackbox.answers import Answer, Answers, keys_of
+from jast._src.blackbox.answers import Answer, Answers, Failing, keys_of
 from jast._src.blackbox.worker import fill
 from jast._src.runtime.host_errors import Log
 
@@ -78,6 +78,15 @@ class Host:
 
     def calls(self):
         return self.done
+
+    def failing(self):
+        """The `Failing` runs so far, each once; of very many the last ones."""
+        with self.lock:
+            return list(self.answers.failures)
+
+    def workers(self):
+        """How many runs are made at a time."""
+        return len(getattr(self.runner, "workers", (None,)))
 
     def __call__(self, dtype, size, live, t, *leaves):
         """Outcomes (event, distance, terminal, log p, seen [..., size]) with the leading axes of
@@ -216,6 +225,9 @@ class Host:
             before = self.answers.get(keys[row])
             if before is None:
                 self.answers.put(keys[row], answer)
+                if answer.event and i not in said:
+                    rows_of = [a[i].copy() for a in x0], [_first_rows(a[i], t[i]) for a in xs]
+                    self.answers.failures.append(Failing(*rows_of, int(t[i])))
             elif i not in said:
                 self._compare(before, answer, partial(example, i))
         return found
@@ -232,3 +244,10 @@ class Host:
             elif before.distance != now.distance:
                 what = "two distances"
             self.log.add("not deterministic", f"the same disturbances gave {what}", example)
+
+
+def _first_rows(a, t):
+    """``a`` with zeros after its first ``t`` rows."""
+    out = np.zeros_like(a)
+    out[:t] = a[:t]
+    return out

@@ -301,6 +301,7 @@ class _Asking:
     def __init__(self, host, function):
         self.host, self.function = host, function
         self.incidents, self.calls = host.incidents, host.calls
+        self.failing, self.workers = host.failing, host.workers
         if host.spec.episodic and not host.spec.run:
             self.compare = partial(compare, host)
         if not host.spec.episodic:

@@ -23,7 +23,7 @@ from jast._src.core.signature import outline
 from jast._src.core.simulator import Simulator, require_simulator
 from jast._src.core.traps import traps
 from jast._src.runtime._jax import is_traced, is_tracing, quick
-from jast._src.runtime.host_errors import incidents, new_incidents, sources
+from jast._src.runtime.host_errors import incidents, new_incidents, runs_on_host, sources
 from jast._src.runtime.memory import release
 from jast._src.util.pytrees import select
 
@@ -37,6 +37,7 @@ __all__ = ["ACTIONS", "OBSERVED", "check", "contract"]
 OBSERVED = 64  # numbers that ``observe`` may return at most to what looks at them, as networks do
 ARRAYS = (jax.Array, np.ndarray, np.generic, bool, int, float)
 LANES = 32  # nominal episodes that `check` runs: a handful, as a step may be slow
+HOSTED_LANES = 8  # of a system on the host, where each is dear
 STEPS = 8  # of each, where the system is not episodic
 DRAWS = 64  # of the actions at the start
 HINTS = {
@@ -63,7 +64,8 @@ ACTIONS = {
 def check(sim: Simulator, actions: Actions | None = None) -> Simulator:
     """Whether a simulator keeps its contract: every function is traced and a few steps are run.
 
-    Runs 33 episodes of an episodic system, and the first steps of any other. Where ``sim`` holds
+    Runs 33 episodes of an episodic system, and the first steps of any other (9 of a system on the
+    host, and one twice). Where ``sim`` holds
     tracers, or inside a transformation of JAX, only the traced half runs. Warns (UserWarning) where
     objects of `jast.blackbox` that are judged at the end only (``episodic=True``) failed on the way
     in some of 16 more episodes, and of what fits together and loses failures all the same (up to 80
@@ -309,7 +311,7 @@ class _Probe(NamedTuple):
 
 @quick
 def _probe(sim, actions):
-    """LANES nominal episodes and the undisturbed one, STEPS steps of each (all, of an episodic
+    """LANES nominal episodes (HOSTED_LANES) and the undisturbed one, STEPS steps of each (all, of an episodic
     system).
     """
     about = outline(sim)
@@ -362,8 +364,9 @@ def _probe(sim, actions):
         x = jax.tree.map(lambda a: a[0], xs)
         return (density, nan, distance), (x0, x, last if sim.episodic else first)
 
-    keys = jax.random.split(jax.random.key(0), LANES + 1)
-    flags, values = jax.vmap(episode)(keys, jnp.arange(LANES + 1) == LANES)
+    lanes = HOSTED_LANES if runs_on_host(sim) else LANES
+    keys = jax.random.split(jax.random.key(0), lanes + 1)
+    flags, values = jax.vmap(episode)(keys, jnp.arange(lanes + 1) == lanes)
     x0, x, judged = jax.tree.map(lambda a: a[0], values)
     share = None
     if actions is not None:
@@ -383,18 +386,18 @@ def _any_nan(a):
 
 def _check_densities(found):
     # the undisturbed lane is at the modes, where a density may be infinite
-    density = found.density[:LANES]
+    density = found.density[:-1]
     for t in np.flatnonzero(density.any(axis=0))[:1]:
         name, where = ("start", "") if t == 0 else ("disturbance", f" at step {t}")
         raise ValueError(
-            f"{name}: log_prob is not finite in {density[:, t].sum()} of {LANES} of its own"
+            f"{name}: log_prob is not finite in {density[:, t].sum()} of {len(density)} of its own"
             f" samples{where}"
         )
 
 
 def _check_numbers(found, went_wrong):
-    def first_wrong(flags):  # [LANES + 1, STEPS + 1] -> a step, or None
-        wrong = (flags[:LANES].mean(axis=0) > 0.5) | (flags[LANES] & bool(found.has_mode))
+    def first_wrong(flags):  # [lanes + 1, STEPS + 1] -> a step, or None
+        wrong = (flags[:-1].mean(axis=0) > 0.5) | (flags[-1] & bool(found.has_mode))
         return int(np.argmax(wrong)) if wrong.any() else None
 
     leaves = jax.tree_util.tree_leaves_with_path(found.state)

@@ -12,6 +12,7 @@ from jast import distributions as D
 from jast._src.core.episode import Episode, play_chosen, replay
 from jast._src.core.rewards import log_likelihood
 from jast._src.core.simulator import Simulator, require_simulator
+from jast._src.runtime.host_errors import runs_on_host
 from jast._src.util import checks, display
 from jast._src.util.intervals import checked_level, clopper_pearson
 from jast._src.util.pytrees import map_in_lanes, select
@@ -22,6 +23,9 @@ if TYPE_CHECKING:
 __all__ = ["Criticality", "criticality"]
 
 LANES = 512  # episodes that are played at a time
+DRAWS = 1000  # continuations of each state by default
+HOSTED_BUDGET = 1000  # episodes of a black box by default
+MOST_LANES = 4096  # the same where no episode may be played in vain
 CERTAIN = 0.95  # a probability from which on a failure counts as certain
 
 
@@ -77,7 +81,13 @@ class Criticality(NamedTuple):
 
 
 def criticality(
-    key: chex.PRNGKey, sim: Simulator, episode: Episode, *, draws: int = 1000, level: float = 0.95
+    key: chex.PRNGKey,
+    sim: Simulator,
+    episode: Episode,
+    *,
+    draws: int | None = None,
+    level: float = 0.95,
+    budget: int | None = None,
 ) -> Criticality:
     """When was the failure still avoidable?
 
@@ -89,14 +99,18 @@ def criticality(
         sim: the simulator, of any kind.
         episode: a failure, or any other episode.
         draws: continuations of each state, at least 1: the standard error is at most
-            0.5 / sqrt(draws). In all ``(length + 1) * draws`` episodes, nearly.
+            0.5 / sqrt(draws). In all ``(length + 1) * draws`` episodes, nearly. Default: 1000, or
+            as many as the ``budget`` affords.
         level: of the intervals, each for itself.
+        budget: evaluations at most, all of them counted. Default: none; 1000 of a black box where
+            ``draws`` is left out.
 
     Returns:
         `Criticality`.
 
     Raises:
-        ValueError: for bad arguments, and where ``episode`` does not fit the simulator.
+        ValueError: for bad arguments, where ``episode`` does not fit the simulator, and for a
+            budget that does not do for the ``draws``, or for one of each state.
 
     Example:
         >>> import jax, jax.numpy as jnp, jast
@@ -108,19 +122,31 @@ def criticality(
     """
     name = "criticality"
     checks.check_random_key(name, key)
-    draws, level = checks.whole_number(name, "draws", draws, 1), checked_level(name, level)
+    level = checked_level(name, level)
     require_simulator(name, sim)
+    hosted = runs_on_host(sim)
+    if draws is not None:
+        draws = checks.whole_number(name, "draws", draws, 1)
+    if budget is not None:
+        budget = checks.whole_number(name, "budget", budget, 1)
+    elif hosted and draws is None:
+        budget = HOSTED_BUDGET
     episode = replay(sim, episode)
     steps = int(episode.length)
+    draws = _affordable_draws(budget, draws, steps)
     rows = np.repeat(np.arange(steps + 1, dtype=np.int32), draws)
     given = jax.tree.map(jnp.asarray, (episode.x0, episode.disturbances))
 
+    size = LANES
+    if hosted or budget is not None:  # hardly an episode more than was asked for
+        size = -(-len(rows) // -(-len(rows) // MOST_LANES))
+
     def lanes(at, kept):
-        keys = jax.random.split(jax.random.fold_in(key, at[0]), LANES)
+        keys = jax.random.split(jax.random.fold_in(key, at[0]), size)
         return _continued(keys, sim, *given, kept)
 
     at = np.arange(len(rows), dtype=np.int32)
-    ended, wrong = map_in_lanes(LANES, lanes, at, rows)
+    ended, wrong = map_in_lanes(size, lanes, at, rows)
     failing, invalid = np.bincount(rows[ended], minlength=steps + 1), int(wrong.sum())
     p = failing / draws
     interval = np.stack([clopper_pearson(int(k), draws, level) for k in failing])
@@ -134,8 +160,24 @@ def criticality(
         steepest=int(np.argmax(np.diff(p))) + 1 if steps else 0,
         draws=draws,
         invalid=invalid,
-        evaluations=-(-len(rows) // LANES) * LANES,
+        evaluations=-(-len(rows) // size) * size,
     )
+
+
+def _affordable_draws(budget: int | None, draws: int | None, steps: int) -> int:
+    """Continuations of each of ``steps + 1`` states. ValueError where the budget is too small."""
+    if budget is None:
+        return DRAWS if draws is None else draws
+    states, least = steps + 1, 1 if draws is None else draws
+    # the last program may play some more, the episode is replayed, and one run is made twice
+    last = -(-budget // MOST_LANES) + 2
+    affordable = min((budget - last) // states, DRAWS)
+    if affordable < least:
+        raise ValueError(
+            f"criticality: budget must be at least {states * least + last}, {least} continuations of"
+            f" {states} states, received {budget}"
+        )
+    return affordable if draws is None else draws
 
 
 @jax.jit

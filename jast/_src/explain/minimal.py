@@ -17,6 +17,7 @@ from jast._src.normal_space.episode_point import (
     number_names,
     number_steps,
 )
+from jast._src.runtime.host_errors import runs_on_host
 from jast._src.util import display
 from jast._src.util.checks import number, whole_number
 
@@ -24,6 +25,10 @@ __all__ = ["Minimal", "minimal"]
 
 SECTIONS = 31  # places between two ends that are looked at together
 SWEEPS = 3  # rounds of shrinking one number after the other
+BUDGET = 5000  # evaluations by default
+HOSTED_BUDGET = 500  # of a black box: two or three orders of an episode of some ten numbers
+MIN_HOSTED_BUDGET = 10  # runs of a black box: fewer than it takes to see that the episode fails
+LAST = 3  # runs of a black box that are kept for the answer: its episode is played and replayed
 PRINTED = 12  # needed disturbances, and runs of steps
 
 
@@ -53,6 +58,8 @@ class Minimal(NamedTuple):
     numbers: int
     """How many numbers the disturbances of the given episode have."""
     evaluations: int
+    complete: bool = True
+    """False where the budget was used up: then fewer may be needed, and smaller ones."""
 
     def __str__(self) -> str:
         steps = sorted({step for step, *_ in self.parts})
@@ -65,11 +72,18 @@ class Minimal(NamedTuple):
         ]
         if len(self.parts) > PRINTED:
             lines.append(f"  ... {len(self.parts) - PRINTED} more")
+        if not self.complete:
+            lines.append(f"the budget was used up: {self.evaluations} evaluations")
         return "\n".join(lines)
 
 
 def minimal(
-    sim: Simulator, episode: Episode, *, orders: int = 8, slack: float = 0.1, budget: int = 5000
+    sim: Simulator,
+    episode: Episode,
+    *,
+    orders: int = 8,
+    slack: float = 0.1,
+    budget: int | None = None,
 ) -> Minimal:
     """Which disturbances of a failure are needed, and how large must they be?
 
@@ -88,7 +102,9 @@ def minimal(
         slack: the share by which disturbances may grow in place of those that are put back, 0 or
             more: of a failure that was pulled to where it is likeliest none could be spared.
         budget: evaluations, at which the work ends with what it has by then. About 70 for each
-            needed disturbance and order.
+            needed disturbance and order. Default: 5000; 500 of a black box, whose runs are never
+            more than the budget, at least 10. What was not looked at by then stays needed, and
+            ``complete`` says so.
 
     Returns:
         `Minimal`.
@@ -104,12 +120,14 @@ def minimal(
         1
     """
     name = "minimal"
-    orders, budget = (
-        whole_number(name, "orders", orders, 1),
-        whole_number(name, "budget", budget, 1),
-    )
+    orders, hosted = whole_number(name, "orders", orders, 1), runs_on_host(sim)
+    if budget is None:
+        budget = HOSTED_BUDGET if hosted else BUDGET
+    budget = whole_number(name, "budget", budget, MIN_HOSTED_BUDGET if hosted else 1)
+    if hosted:
+        budget -= LAST
     slack = number(name, "slack", slack, lambda v: 0 <= v < np.inf, "0 or more")
-    g = failing_point(name, sim, episode)
+    g = failing_point(name, sim, episode, most=budget)
     if (farther := g._replace(v=(1 + slack) * g.v)).judge(farther.v[None]).failure[0]:
         g = farther
     kept = _find_needed(g, orders, budget)
@@ -125,6 +143,7 @@ def minimal(
         parts=_parts(sim, e, v, kept),
         numbers=int(g.outcome.used[0]),
         evaluations=g.judge.spent,
+        complete=g.judge.spent < budget,
     )
 
 

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Monitor", "monitor"]
 
+AFTER = 4  # evaluations of each episode: an ordinary one beside it, and all three are watched
 HELD_OUT = 0.3  # the share of the episodes that tells how good the monitor is
 ASIDE = 0.3  # of the other ordinary ones, the share that sets the threshold
 EPISODES = 12  # failures, and others, the least
@@ -130,6 +131,7 @@ def monitor(
     key: chex.PRNGKey | None = None,
     episodes: int = 1000,
     level: float = 0.95,
+    budget: int | None = None,
 ) -> Monitor:
     """A runtime monitor: will the system fail within the next ``within`` steps?
 
@@ -157,6 +159,8 @@ def monitor(
             at most; at least 40.
         level: of the intervals: exact ones of shares, and of the area that of the bootstrap over
             episodes (Efron 1979).
+        budget: evaluations at most, without ``others``: 16 for each of the ``episodes``, of which
+            there are fewer where it affords no more. Default: none; 3000 of a black box.
 
     Returns:
         `Monitor`.
@@ -179,12 +183,14 @@ def monitor(
     checks.check_random_key(name, key)
     within = checks.whole_number(name, "within", within, 1)
     episodes = checks.whole_number(name, "episodes", episodes, 40)
+    if budget is not None:
+        budget = checks.whole_number(name, "budget", budget, 1)
     rate = checks.number(name, "false_alarms", false_alarms, lambda v: 0 <= v <= 1, "from 0 to 1")
     level = checks.number(name, "level", level, lambda v: 0 < v < 1, "between 0 and 1")
     if model not in MODELS:
         raise ValueError(f"{name}: model must be one of {sorted(MODELS)}, received {model!r}")
     first, second = jax.random.split(key)
-    e, owner, group, spent = _episodes(name, first, sim, failures, others, episodes)
+    e, owner, group, spent = _episodes(name, first, sim, failures, others, episodes, budget)
     seen = observations(name, sim, sim.observe if observe is None else observe, e)
     rng = numpy_generator(second)
     out = hold_out(rng, owner, group, HELD_OUT)
@@ -249,13 +255,16 @@ def _logistic(name: str) -> Any:
 MODELS: dict[str, Callable] = {"boosted": _boosted, "logistic": _logistic}
 
 
-def _episodes(name, key, sim, failures, others, episodes):
+def _episodes(name, key, sim, failures, others, episodes, budget):
     """The episodes [n], what they are [n], their group [n], evaluations."""
     if others is not None:
         cases = given_cases(name, sim, failures, others, None, EPISODES)
         return cases.episodes, cases.kind, cases.group, 0
     own, calm = jax.random.split(key)
-    cases = simulate_cases(name, own, sim, failures, None, episodes)
+    cases = simulate_cases(
+        name, own, sim, failures, None, episodes, budget=budget, after=AFTER
+    )
+    episodes = cases.asked
     plain = draw_ordinary(calm, sim, episodes)
     n = len(plain.length)
     if n < EPISODES:

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Rules", "rules"]
 
+AFTER = 2  # evaluations of a failure and its near miss once they are known: played to the horizon
 HELD_OUT = 0.3  # the share of the episodes that tells how often the rules are right
 OF = "disturbances", "states", "both"
 
@@ -111,6 +112,7 @@ def rules(
     lead: int = 5,
     most: int = 8,
     level: float = 0.95,
+    budget: int | None = None,
 ) -> Rules:
     """Which rule describes the failures?
 
@@ -148,6 +150,8 @@ def rules(
         most: ways through the tree at most, 2 or more. How many there are is chosen by parts of the
             episodes that are not held out.
         level: of the intervals (Clopper and Pearson 1934), which take the episodes for independent.
+        budget: evaluations at most, without ``others``: 14 for each of the ``episodes``, of which
+            there are fewer where it affords no more. Default: none; 3000 of a black box.
 
     Returns:
         `Rules`; printed they are sentences.
@@ -173,6 +177,8 @@ def rules(
         checks.whole_number(name, "most", most, 2),
         checks.whole_number(name, "lead", lead, 0),
     )
+    if budget is not None:
+        budget = checks.whole_number(name, "budget", budget, 1)
     level = checks.number(name, "level", level, lambda v: 0 < v < 1, "between 0 and 1")
     if of not in OF:
         raise ValueError(f"{name}: of must be one of {OF}, received {of!r}")
@@ -180,10 +186,10 @@ def rules(
     number = isinstance(others, int | np.integer) and not isinstance(others, bool)
     if others is None or number:
         many = checks.whole_number(name, "others", others, 1) if number else None
-        cases = simulate_cases(name, first, sim, failures, labels, episodes, many)
+        cases = simulate_cases(name, first, sim, failures, labels, episodes, many, budget, AFTER)
     else:
         cases = given_cases(name, sim, failures, others, labels, DISTINCT)
-    e, owner, group, names, spent = cases
+    e, owner, group, names, spent = cases[:5]
     seen = play_to_horizon(sim, e, second, of != "disturbances")
     rng = numpy_generator(third)
     ends = e.length[owner > 0]

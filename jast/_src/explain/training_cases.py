@@ -10,11 +10,13 @@ from jast._src.core.episode import Episode
 from jast._src.core.simulator import Simulator
 from jast._src.explain.episodes import distinct_rows, gather_episodes, named_kinds
 from jast._src.explain.held_out import DISTINCT
-from jast._src.explain.variants import draw_variants, find_seeds
+from jast._src.explain.variants import EACH, draw_variants, find_seeds
+from jast._src.runtime.host_errors import runs_on_host
 
 __all__ = ["OTHERS", "Cases", "given_cases", "simulate_cases"]
 
 OTHERS = "does not fail"  # what the others are called
+HOSTED_BUDGET = 3000  # evaluations of a black box by default
 DRAWS = 4  # of an estimate, that are looked at for each episode wanted
 
 
@@ -29,6 +31,8 @@ class Cases(NamedTuple):
     names: tuple
     """Of the kinds."""
     evaluations: int
+    asked: int = 0
+    """Failures that were to be simulated."""
 
 
 def simulate_cases(
@@ -39,9 +43,24 @@ def simulate_cases(
     labels: Sequence | None,
     episodes: int,
     most: int | None = None,
+    budget: int | None = None,
+    after: int = 0,
 ) -> Cases:
-    """Variants of ``failures``: ``episodes`` that fail and at most ``most`` near misses."""
+    """Variants of ``failures``: ``episodes`` that fail and at most ``most`` near misses; fewer
+    where the ``budget`` affords no more, of which each takes ``after`` evaluations afterwards.
+    """
     seeds = find_seeds(function, sim, failures, labels, DRAWS * episodes)
+    if budget is None and runs_on_host(sim):
+        budget = HOSTED_BUDGET
+    if budget is not None:
+        # one run of a black box is made twice
+        each, spent = EACH + after, seeds.evaluations + 1
+        episodes = min(episodes, (budget - spent) // each)
+        if episodes < 2 * DISTINCT:
+            raise ValueError(
+                f"{function}: budget must be at least {spent + 2 * DISTINCT * each}, {each} evaluations"
+                f" for each of {2 * DISTINCT} failures, received {budget}"
+            )
     v = draw_variants(key, sim, seeds, episodes)
     if len(v.label) < 2 * DISTINCT:
         raise ValueError(
@@ -63,6 +82,7 @@ def simulate_cases(
         group=group,
         names=(OTHERS, *seeds.names),
         evaluations=seeds.evaluations + v.evaluations,
+        asked=episodes,
     )
 
 

@@ -21,10 +21,11 @@ from jast._src.normal_space.pcn import proposed
 from jast._src.search.refine.modes import Modes, owners
 from jast._src.util.pytrees import count_numbers
 
-__all__ = ["Seeds", "Variants", "draw_variants", "find_seeds"]
+__all__ = ["EACH", "Seeds", "Variants", "draw_variants", "find_seeds"]
 
 # how far the disturbances of a move go: 1 is a new draw; None: they all come some steps later
 SCALES = (1.0, 0.3, None, 1.0, 0.7, 1.0, None, 0.15, 1.0, 0.5)
+EACH = len(SCALES) + 2  # evaluations of a failure and its near miss: moves, and both are played
 MODES = 6  # that are told apart
 CROWDED = 0.25  # share of the chains from one seed above which seeds are not held out as a whole
 UNKNOWN_WEIGHT = -700.0  # log weight that counts only where nothing else is known

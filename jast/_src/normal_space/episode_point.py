@@ -41,8 +41,12 @@ class EpisodePoint(NamedTuple):
     """Of the point, one row"""
 
 
-def failing_point(name: str, sim: Simulator, episode: Episode) -> EpisodePoint:
-    """The `EpisodePoint` of an ``episode`` that must fail where it is replayed."""
+def failing_point(
+    name: str, sim: Simulator, episode: Episode, most: int | None = None
+) -> EpisodePoint:
+    """The `EpisodePoint` of an ``episode`` that must fail where it is replayed; ``most`` of its
+    `Judge`.
+    """
     if not isinstance(episode, Episode):
         raise ValueError(
             f"{name}: episode must be a jast.Episode (as of result.failures or jast.replay),"
@@ -57,7 +61,7 @@ def failing_point(name: str, sim: Simulator, episode: Episode) -> EpisodePoint:
     of_modes = centred(sim)
     one = jax.tree.map(lambda a: np.asarray(a)[None], episode._replace(states=None))
     recorded = transform.normal_of(of_modes, one)[0].astype(np.float64)
-    judge = Judge(of_modes)
+    judge = Judge(of_modes, most)
     # the way to normal numbers and back rounds, and a refined failure lies on the edge of failing
     for lift in LIFTS if bool(episode.failure) else LIFTS[:1]:
         v = (1 + lift) * recorded

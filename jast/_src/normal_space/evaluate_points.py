@@ -25,15 +25,36 @@ HELD = 2**20  # numbers that a call may take
 
 
 class Judge:
-    """Judges points of ``sim`` and counts the episodes, ``spent``."""
+    """Judges points of ``sim`` and counts the episodes, ``spent``.
 
-    def __init__(self, sim: Simulator):
+    A black box runs for no more than ``most`` points: what is beyond comes back as invalid.
+    """
+
+    def __init__(self, sim: Simulator, most: int | None = None):
         self.sim, self.dtype, self.spent = sim, transform.normal_numbers(sim), 0
+        self.most = most if runs_on_host(sim) else None
 
     def __call__(self, points: np.ndarray) -> transform.Outcomes:
         """`Outcomes` [m] of ``points`` [m, D]."""
-        self.spent += len(points)
-        return judged(self.sim, np.asarray(points, self.dtype))
+        points = np.asarray(points, self.dtype)
+        n, room = len(points), len(points)
+        if self.most is not None:
+            room = max(min(n, self.most - self.spent), 0)
+        self.spent += room
+        if room == n:
+            return judged(self.sim, points)
+        none = transform.Outcomes(
+            failure=np.zeros(n, bool),
+            distance=np.full(n, np.inf, self.dtype),
+            used=np.zeros(n, np.int32),
+            length=np.zeros(n, np.int32),
+            invalid=np.ones(n, bool),
+            log_p=np.full(n, -np.inf, self.dtype),
+        )
+        if not room:
+            return none
+        found = judged(self.sim, points[:room])
+        return jax.tree.map(lambda a, b: np.concatenate([a, b[room:]]), found, none)
 
 
 def judged(sim: Simulator, z: np.ndarray, play: Callable = transform.outcome) -> Any:

@@ -18,9 +18,12 @@ __all__ = [
     "Incident",
     "KINDS",
     "Log",
+    "failing_runs",
+    "in_full_batches",
     "incidents",
     "merge_incidents",
     "new_incidents",
+    "runs_made",
     "runs_on_host",
     "sources",
 ]
@@ -131,6 +134,22 @@ def sources(sim, name) -> Iterator[Any]:
 def runs_on_host(sim):
     """Whether the simulator runs on the host: a black box, slow and without gradients."""
     return any(True for _ in sources(sim, "incidents"))
+
+
+def runs_made(sim):
+    """How often the host code behind a simulator has started to run so far: 0 of one in JAX."""
+    return sum(source.calls().episodes for source in sources(sim, "calls"))
+
+
+def failing_runs(sim):
+    """The runs of a black box that failed so far, each once, as its workplace keeps them."""
+    return [run for source in sources(sim, "failing") for run in source.failing()]
+
+
+def in_full_batches(sim, least):
+    """The least number of runs, ``least`` or more, that keeps all workers of a simulator busy."""
+    workers = max((source.workers() for source in sources(sim, "workers")), default=1)
+    return -(-least // workers) * workers
 
 
 def incidents(sim: Simulator) -> tuple[Incident, ...]:

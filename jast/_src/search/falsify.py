@@ -20,6 +20,7 @@ from jast._src.core.signature import outline
 from jast._src.core.simulator import Simulator
 from jast._src.normal_space.transform import Outcomes, check, normal_numbers, outcome, played
 from jast._src.runtime._jax import jit
+from jast._src.runtime.host_errors import in_full_batches
 from jast._src.search.best_episodes import standard_reward
 from jast._src.search.driver import Log, finish, require_counts, require_host, run
 from jast._src.search.lanes import NEVER, Tally
@@ -38,6 +39,8 @@ LANES = 64
 """Failures whose normal numbers one program, of one shape, makes."""
 TAIL = 3e-5
 """Probability beyond what is taken for an end of a disturbance's range: 4 standard deviations."""
+BATCH = 10
+"""Simulations side by side."""
 FIRST_SIGNALS = 30
 """Signals of few pieces that are drawn before any is changed."""
 POOL = 10
@@ -88,7 +91,7 @@ def falsify(
     sim: Simulator,
     *,
     simulations: int = 300,
-    batch: int = 10,
+    batch: int | None = None,
     stop: bool = True,
     top: int = 64,
     progress: bool = False,
@@ -109,7 +112,8 @@ def falsify(
         key: consumed.
         sim: the simulator; its disturbances have quantile functions.
         simulations: the most that are run.
-        batch: simulations side by side; with 1, each learns from all before it.
+        batch: simulations side by side; with 1, each learns from all before it. Default: 10; of a
+            black box with workers the least multiple of their number from 10 on.
         stop: end with the batch that has the first failure.
         top: distinct failures kept.
         progress: whether to show a progress bar.
@@ -132,6 +136,8 @@ def falsify(
         True
     """
     name = "falsify"
+    if batch is None:
+        batch = in_full_batches(sim, BATCH)
     simulations, batch, top = require_counts(name, simulations=simulations, batch=batch, top=top)
     require_host(name, key, sim)
     check(name, sim)

@@ -16,6 +16,7 @@ from jax import lax
 from jast._src.core.episode import Episode
 from jast._src.core.signature import outline
 from jast._src.core.transition import advance, begin, conclude
+from jast._src.runtime.host_errors import runs_on_host
 from jast._src.search.result import Trials
 from jast._src.search.tree.packing import pack
 
@@ -121,6 +122,9 @@ def play_lanes(sim, reward, keys, draw_start, draw, live, rows=None, record=Fals
     like = outline(sim)
     start = int(like.random_start)
     rows = ((), ()) if rows is None else rows
+    if runs_on_host(sim):  # which runs nothing twice: what is not live does what another lane does
+        like_lane = jnp.where(live, jnp.arange(len(live)), jnp.argmax(live))
+        keys, rows = keys[like_lane], jax.tree.map(lambda a: a[:, like_lane], rows)
 
     def at(level, rows, t):
         own = jax.vmap(jax.random.fold_in, (0, None))(keys, level)

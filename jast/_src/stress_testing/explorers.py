@@ -21,6 +21,7 @@ from jast._src.normal_space import transform
 from jast._src.normal_space.mode_coordinates import centred
 from jast._src.runtime.host_errors import runs_on_host
 from jast._src.search.cem import cem
+from jast._src.search.falsify import falsify
 from jast._src.search.forest import forest
 from jast._src.search.go_explore.go_explore import go_explore
 from jast._src.search.monte_carlo import monte_carlo
@@ -30,6 +31,7 @@ __all__ = [
     "Explorer",
     "ExplorerResult",
     "divide_budget",
+    "failing_episodes",
     "failures_at",
     "has_quantiles",
     "slow_cross_entropy",
@@ -80,6 +82,11 @@ def plain_draws(key: jax.Array, sim: Simulator, budget: int) -> ExplorerResult:
     """Draws of the model."""
     reward = likelihood(sim)
     return _from_search(monte_carlo(key, sim, episodes=budget, reward=reward, top=MAX_FAILURES))
+
+
+def falsified(key: jax.Array, sim: Simulator, budget: int) -> ExplorerResult:
+    """The first failures that signals of few pieces lead to; ends with these."""
+    return _from_search(falsify(key, sim, simulations=budget, top=MAX_FAILURES))
 
 
 def cooled_noise(key: jax.Array, sim: Simulator, budget: int) -> ExplorerResult:
@@ -133,14 +140,15 @@ class Explorer(NamedTuple):
 
     run: Callable[[jax.Array, Simulator, int], ExplorerResult]
     min_evaluations: int | None
-    """Below which it is not worth a call; None where it is called only if nothing else found a
-    failure"""
+    """Below which it is not worth a call; None where it is called by itself: first, of a system on
+    the host, or only if nothing else found a failure"""
     needs_quantiles: bool = False
     """Whether the disturbances need quantile functions"""
     needs_gradients: bool = False
 
 
 EXPLORERS = {
+    "falsify": Explorer(falsified, None, needs_quantiles=True),
     "widened noise, cooled": Explorer(cooled_noise, COOLED_EVALUATIONS, needs_quantiles=True),
     "plain draws": Explorer(plain_draws, 30),
     "gradients": Explorer(
@@ -186,6 +194,25 @@ def failures_at(sim: Simulator, points: np.ndarray) -> ExplorerResult:
     e = transform.played(sim, points)
     e = jax.tree.map(lambda a: a[e.failure], e)
     return ExplorerResult(e, len(points), len(e.length), 0)
+
+
+def failing_episodes(sim: Simulator, runs: list) -> Episode:
+    """The failing ``runs`` of a black box as a batch of episodes, to be replayed; at least one."""
+    like, n = outline(sim), len(runs)
+    zero, number = np.zeros(n, like.dtype), np.array([run.t for run in runs], np.int32)
+    x0, x = (
+        jax.tree.structure(tree).unflatten([np.stack(a) for a in zip(*leaves, strict=True)])
+        for tree, leaves in ((like.x0, [r.x0 for r in runs]), (like.x, [r.xs for r in runs]))
+    )
+    return Episode(
+        x0=x0,
+        disturbances=x,
+        log_prob=zero,
+        distance=zero,
+        failure=np.ones(n, bool),
+        length=number,
+        reward=zero,
+    )
 
 
 def _number(budget, each, least, most):

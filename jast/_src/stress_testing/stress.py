@@ -34,6 +34,7 @@ from jast._src.normal_space import transform
 from jast._src.runtime import work
 from jast._src.runtime._jax import briefly
 from jast._src.runtime.checkpoints import keep_answers, open_checkpoint
+from jast._src.runtime.host_errors import failing_runs, runs_made, runs_on_host
 from jast._src.runtime.progress_bar import Watch
 from jast._src.search.refine.modes import Mode, Modes, modes, spread
 from jast._src.search.refine.refine import refine
@@ -41,6 +42,7 @@ from jast._src.stress_testing.explorers import (
     EXPLORERS,
     ExplorerResult,
     divide_budget,
+    failing_episodes,
     failures_at,
     has_quantiles,
     slow_cross_entropy,
@@ -92,6 +94,13 @@ the crossing, the cart-pole and the ship failures are as likely with half as man
 coolings, which cost a tenth of the CPU time."""
 POOL_FACTOR = 32
 """Failures in the pool for each that is returned: modes are told apart among these."""
+LAST_SHARE = 0.15
+"""Share of the budget that a black box keeps for the probability, whatever came before."""
+FALSIFY_SHARE = 0.2
+"""Share of a black box's search that looks for a first failure, at most, where several explorers
+follow; below `MIN_DIVIDED_BUDGET` all of it may."""
+LEAST_REFINED = 100
+"""Evaluations that `refine` takes at least."""
 REFINED_FACTOR = 8
 """Failures that refinement starts from for each that is returned."""
 FOUND_FACTOR = 4
@@ -147,10 +156,11 @@ def stress(
     Args:
         key: consumed.
         sim: the simulator.
-        budget: evaluations (episodes; one with its gradient counts as 3 or 4) in all, nearly; at
-            least 300. Default: what a cheap system simulates in some eight CPU seconds, at most
-            33,554,432; 200,000 of others. Where only the standard error of the probability makes it
-            UNRELIABLE, and 4,194,304 would do, everything is done again with these (but not with a
+        budget: evaluations (episodes; one with its gradient counts as 3 or 4) in all, nearly; of
+            a black box its runs, never more, with all that the call runs; at least 300. Default:
+            what a cheap system simulates in some eight CPU seconds, at most 33,554,432; 200,000 of
+            others. Where only the standard error of the probability makes it UNRELIABLE, and
+            4,194,304 would do, everything is done again with these (but not with a
             ``checkpoint``). The report's ``settings`` name the one that was used.
             Below 10,417 the probability is that of `failure_probability` with few calls.
         seconds: in place of ``budget``: as many evaluations as the system simulates in so many CPU
@@ -186,12 +196,14 @@ def stress(
         budget = checks.whole_number(name, "budget", budget, MIN_BUDGET)
     top = checks.whole_number(name, "top", top, 1)
     require_simulator(name, sim)
+    begun = runs_made(sim), len(failing_runs(sim))
     check(sim)
     by_default = budget is None and seconds is None and checkpoint is None
     if budget is None and seconds is None and not has_quantiles(sim):
         budget = DEFAULT_BUDGET
     if budget is None:
         budget = budgets.measure_budget(name, key, sim, seconds, MIN_BUDGET, DEFAULT_BUDGET)
+        begun = runs_made(sim), begun[1]
     settings = call_settings(name, key, budget=budget, top=top)
     ways = work.placement(name, executor, devices)
     with (
@@ -202,6 +214,9 @@ def stress(
     ):
         ways = ways._replace(store=store)
         test = _StressTest(key, sim, budget, top=top, watch=watch, ways=ways, checkpoint=checkpoint)
+        if test.hosted:
+            test.made, test.known = begun
+            test.note("check", 0)
         try:
             test.run_nominal()
             if test.cheap:
@@ -242,6 +257,7 @@ class _StressTest:
         self.residual = self.late = np.nan
         self.has_points = has_quantiles(sim)
         large = (1 - sum(LARGE_SHARES)) * budget >= MIN_ESTIMATE_BUDGET
+        self.hosted, self.made, self.known = runs_on_host(sim), 0, 0
         self.cheap = self.has_points and budgets.uses_populations(sim, budget)
         shares = COUNTING_SHARES
         if self.has_points:
@@ -251,18 +267,32 @@ class _StressTest:
         # what populations do not answer gains little from more
         self.parts = BudgetShares(*(int(share * min(budget, DEFAULT_BUDGET)) for share in shares))
         self.modes_budget = int(MODES_SHARE * budget)
+        # evaluations that a black box, which must not run once too often, keeps for its estimate
+        self.last = int(LAST_SHARE * budget) if self.hosted else 0
 
     def next_key(self):
         self.key, key = jax.random.split(self.key)
         return key
 
     def note(self, name, evaluations, failing=0, best=-np.inf, invalid=0):
-        """Count a piece of the work."""
+        """Count a piece of the work; of a black box, what it ran in this process."""
+        if self.hosted:
+            self.made, before = runs_made(self.sim), self.made
+            if self.ways.executor is None:
+                evaluations = self.made - before
         self.tried.append(Tried(name, int(evaluations), int(failing), float(best)))
         self.spent += int(evaluations)
         self.invalid += int(invalid)
         self.watch.reach(min(self.spent, self.budget))
         self.watch.tell()
+
+    def affordable(self, evaluations: int) -> int:
+        """``evaluations``, of a black box at most those that it may still run before its
+        estimate.
+        """
+        if not self.hosted:
+            return evaluations
+        return max(min(evaluations, self.budget - self.spent - self.last), 0)
 
     def run_nominal(self):
         """The system as it is."""
@@ -317,14 +347,21 @@ class _StressTest:
 
     def search(self):
         """Every explorer once; then those again whose failures get likelier for what they cost."""
-        total = self.parts.search
-        end, once = self.spent + total, total < MIN_DIVIDED_BUDGET
+        total = self.affordable(self.parts.search)
+        once = total < MIN_DIVIDED_BUDGET
+        if self.hosted and self.has_points:  # does it fail at all?
+            before = self.spent
+            self.explore("falsify", total if once else int(FALSIFY_SHARE * total))
+            total -= self.spent - before
+        end = self.spent + total
         first = divide_budget(self.sim, total if once else int(EVEN_SHARE * total))
         gains = {name: self.explore(name, each) for name, each in first.items()}
         if once:
             return
         if not len(self.pool):  # nothing points to failures, or they are far away
-            self.explore("kept states", end - self.spent + self.parts.slow_search)
+            more = self.affordable(end - self.spent + self.parts.slow_search)
+            if more > 0:
+                self.explore("kept states", more)
         calls = dict.fromkeys(first, 1)
         again = int((1 - EVEN_SHARE) * total / FURTHER_CALLS)
         while self.spent + again <= end:
@@ -376,8 +413,12 @@ class _StressTest:
 
     def refine_from(self, start: Failures, budget: int) -> Failures:
         """Refine the failures ``start`` and tell modes apart; returns the best of each mode."""
+        budget = self.affordable(max(LEAST_REFINED, budget))
+        if budget < LEAST_REFINED:  # of a black box that may run no longer
+            self.tell_modes(start[: self.top])
+            return self.best_of_modes()
         self.watch.doing("refining failures")
-        result = refine(self.next_key(), self.sim, start, budget=max(100, budget))
+        result = refine(self.next_key(), self.sim, start, budget=budget)
         found = result.failures
         if len(found):
             self.residual, self.late = float(result.residual[0]), float(result.late[0])
@@ -385,13 +426,17 @@ class _StressTest:
             self.refined = merge(self.refined, found, top=self.top)
         best = _best_log_density(found)
         self.note("refine", result.episodes, len(found), best, result.invalid)
+        self.tell_modes(found if len(found) else self.pool[:1])
+        return self.best_of_modes()
+
+    def tell_modes(self, candidates: Failures) -> None:
+        """The modes of refined failures."""
         self.watch.doing("telling modes apart")
-        candidates = found if len(found) else self.pool[:1]
         if self.modes:  # none is lost to a second refinement that had no time for it
             candidates = merge(candidates, self.best_of_modes(), top=REFINED_FACTOR * self.top)
-        self.modes = modes(self.sim, candidates, self.pool, budget=self.modes_budget)
+        budget = self.affordable(self.modes_budget)
+        self.modes = modes(self.sim, candidates, self.pool, budget=budget)
         self.note("telling modes apart", self.modes.evaluations)
-        return self.best_of_modes()
 
     def is_locally_likeliest(self) -> bool:
         """Whether slopes have led to the likeliest failure, and there are few basins."""
@@ -399,7 +444,7 @@ class _StressTest:
 
     def search_slowly(self, start: Failures) -> Failures:
         """Likelier failures by many small steps, one half of them from the likeliest known."""
-        budget = self.parts.slow_search // 2
+        budget = self.affordable(self.parts.slow_search) // 2
         if budget < MIN_DIVIDED_BUDGET:
             return start
         self.watch.doing("searching by slow cross-entropy")
@@ -418,8 +463,8 @@ class _StressTest:
         rest = max(self.budget - self.spent, 1)
         folder = None if self.checkpoint is None else Path(self.checkpoint) / "probability"
         places = dict(executor=self.ways.executor, devices=self.ways.devices, checkpoint=folder)
-        if not self.has_points:
-            n = max(rest, MIN_COUNTED_EPISODES)
+        if not self.has_points or self.hosted and rest < few_calls.LEAST:
+            n = rest if self.hosted else max(rest, MIN_COUNTED_EPISODES)
             p = monte_carlo(self.next_key(), self.sim, n, **places)
             return self.keep_probability(p, "plain draws")
         if not len(self.pool):  # the estimate may find what the search did not
@@ -430,7 +475,7 @@ class _StressTest:
         rest = max(rest, few_calls.LEAST)
         p = failure_probability(self.next_key(), self.sim, rest, failures=failures, **places)
         self.keep_probability(p, "probability")
-        if p.proposal is None:
+        if p.proposal is None or self.hosted and self.budget - self.spent < shares_cost(self.budget):
             return
         if not len(self.pool):
             self.redraw_failures(p.proposal)
@@ -445,6 +490,14 @@ class _StressTest:
         plain = tuple(a + b for a, b in zip(drawn, own, strict=True))
         self.probability = p._replace(plain=plain)
         self.note(name, p.episodes, p.failing, invalid=p.invalid)
+
+    def keep_failing_runs(self):
+        """Every failing run of a black box joins what the report shows, whoever made it."""
+        runs = failing_runs(self.sim)[self.known :]
+        if runs:
+            found = collect(self.sim, self.reward, failing_episodes(self.sim, runs), top=self.top)
+            self.failures = merge(self.failures, found, top=self.top)
+            self.note("failing runs kept", 0)
 
     def redraw_failures(self, q):
         """Failures that the estimate's proposal draws, where the search found none."""
@@ -468,6 +521,7 @@ class _StressTest:
             self.note("shares of modes", cost, failing)
 
     def report(self, settings):
+        self.keep_failing_runs()
         return Report(
             nominal=self.nominal,
             failures=self.failures[: self.top],

@@ -190,7 +190,7 @@ class Paths:
     """
 
     def __init__(self, sim: Simulator, budget: int):
-        self.sim, self.budget, self.judge = sim, budget, Judge(sim)
+        self.sim, self.budget, self.judge = sim, budget, Judge(sim, most=budget)
         self.rng = np.random.default_rng(0)  # of moves: the same failures are always told the same
 
     @property

@@ -176,6 +176,10 @@ def first_failing_lift(failure: np.ndarray, n: int) -> tuple[np.ndarray, np.ndar
     return points, np.argmax(failure[:, points], axis=0) * n + points
 
 
+HOSTED_LIFTS = 2
+"""Lifts of each point that are tried at the end where each is a run of a black box."""
+
+
 class _Track:
     """One point on its way."""
 
@@ -197,6 +201,7 @@ class _Refinement:
 
     def __init__(self, rng, sim, given, gradients):
         self.rng, self.sim, self.given, self.gradients = rng, sim, given, gradients
+        self.hosted = runs_on_host(sim)
         self.of_modes, self.first = centred(sim), count_numbers(outline(sim).x0)
         self.v = normal_of(self.of_modes, given)
         self.value = np.asarray(given.reward, np.float64)
@@ -217,7 +222,7 @@ class _Refinement:
             if not self.live:
                 return
             for _ in range(LOOK):
-                if self.spent + len(self.live) * self.cost > budget:
+                if self.spent + len(self.live) * self.cost > budget - self._at_the_end():
                     return
                 self._round()
             for track in self.live:
@@ -227,6 +232,10 @@ class _Refinement:
             self.live = [t for t in self.live if t in going]
             self.arrived += [t for t in self.live if t.arrived()]
             self.live = [t for t in self.live if not t.arrived()]
+
+    def _at_the_end(self):
+        """Runs of a black box that `result` may take."""
+        return HOSTED_LIFTS * len(self.live + self.arrived + self.done) if self.hosted else 0
 
     def _distinct(self, **same):
         """The tracks that are not the same as a likelier one (`distinct_points`), the likeliest
@@ -246,12 +255,22 @@ class _Refinement:
         rows = self._next(room - len(self.live))
         if not rows:
             return
-        lifted = lift(self.v[rows]).reshape(-1, self.v.shape[1])
-        points, failure = first_points(self.of_modes, lifted)
+        if not self.hosted:
+            self._start_at(rows, lift(self.v[rows]))
+            return
+        for i in range(len(LIFTS)):  # a black box runs farther out only where it must
+            started = self._start_at(rows, lift(self.v[rows])[i : i + 1]) if rows else set()
+            rows = [row for k, row in enumerate(rows) if k not in started]
+
+    def _start_at(self, rows, lifted):
+        """Start where the least of the lifts, [L, n, D] of ``rows``, fails; returns which [m]."""
+        points, failure = first_points(self.of_modes, lifted.reshape(-1, self.v.shape[1]))
         self.spent += len(failure)
-        for k, row in zip(*first_failing_lift(failure, len(rows)), strict=True):
-            point = Point(*(a[row] for a in points))
+        started, places = first_failing_lift(failure, len(rows))
+        for k, place in zip(started, places, strict=True):
+            point = Point(*(a[place] for a in points))
             self.live.append(_Track(point, int(rows[k]), self.spent))
+        return set(started.tolist())
 
     def _next(self, n):
         """At most ``n`` of the failures not yet tried: the likeliest; then by turns the likeliest
@@ -308,11 +327,12 @@ class _Refinement:
             points = _stacked(tracks)
             if self.gradients:
                 residual = residuals(points).astype(np.float64)
-            lifted = lift(points.v.astype(np.float64)).reshape(-1, self.v.shape[1])
-            tries = played(self.of_modes, lifted)
+            lifted = lift(points.v.astype(np.float64))[: HOSTED_LIFTS if self.hosted else None]
+            tries = played(self.of_modes, lifted.reshape(-1, self.v.shape[1]))
         for i in range(n):
             own = jax.tree.map(lambda a, i=i: a[origin[i]], self.given)
-            lifts = (jax.tree.map(lambda a, k=k: a[k], tries) for k in range(i, len(lifted), n))
+            each = range(i, len(tries.length), n)
+            lifts = (jax.tree.map(lambda a, k=k: a[k], tries) for k in each)
             for e in (*lifts, own):
                 # compiled programs may differ on a knife edge: what the replay says counts
                 e = replay(self.sim, e, reward=reward)._replace(states=None)
