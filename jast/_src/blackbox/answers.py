@@ -11,9 +11,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jast._src.blackbox.worker import history
+from jast._src.blackbox.worker import Reply, history
 
-__all__ = ["Answer", "Answers", "Failing", "keys_of"]
+__all__ = ["Answer", "Answers", "Failing", "keys_of", "part_of"]
 
 HELD = 2**26
 """Bytes that answers may take, those of failures and those of others each; then the oldest goes."""
@@ -64,6 +64,42 @@ class Answers:
         if len(kept) >= self.most:
             del kept[next(iter(kept))]
         kept[key] = answer
+
+
+    def put_part(self, part: list[np.ndarray], starts: int) -> None:
+        """The answers and failures of a part of a checkpoint (`part_of`)."""
+        keys, event, distance, terminal, log_p, seen, *_ = part
+        for i, key in enumerate(keys):
+            numbers = float(distance[i]), bool(terminal[i]), float(log_p[i])
+            self.put(key.tobytes(), Answer(bool(event[i]), *numbers, seen[i].tobytes()))
+        self.put_failing(part, starts)
+
+    def put_failing(self, part: list[np.ndarray], starts: int) -> None:
+        """Those of a part that failed, with their disturbances; ``starts``: leaves of x0."""
+        t, *leaves = part[6:]
+        for i in range(len(t)):
+            rows = [a[i] for a in leaves]
+            self.failures.append(Failing(rows[:starts], rows[starts:], int(t[i])))
+
+
+def part_of(
+    keys: list[bytes],
+    rows: list[int],
+    reply: Reply,
+    t: np.ndarray,
+    x0: list[np.ndarray],
+    xs: list[np.ndarray],
+) -> list[np.ndarray]:
+    """What a checkpoint keeps of the ``rows`` [n] of a reply: their ``keys`` and answers, and of
+    those that failed how many disturbances they had and the leaves of x0 and of these.
+    """
+    answers = [a[rows] for a in (reply.event, reply.distance, reply.terminal, reply.log_p)]
+    failing = np.array(rows)[reply.event[rows]]
+    behind = np.arange(xs[0].shape[1]) >= t[failing, None] if xs else None
+    kept = [np.where(behind.reshape(*behind.shape, *(1,) * (a.ndim - 2)), 0, a[failing]) for a in xs]
+    kept = [b.astype(a.dtype) for a, b in zip(xs, kept, strict=True)]
+    names = np.frombuffer(b"".join(keys), np.uint8).reshape(len(keys), KEY)
+    return [names, *answers, reply.seen[rows], t[failing], *(a[failing] for a in x0), *kept]
 
 
 def keys_of(x0: list[np.ndarray], xs: list[np.ndarray], t: np.ndarray) -> list[bytes]:

@@ -4,14 +4,17 @@ memory of past outcomes. NumPy only, never JAX.
 
 from __future__ import annotations
 
+import contextlib
+import itertools
 import threading
 import time
+from collections.abc import Callable
 from functools import cache, partial
 from typing import NamedTuple
 
 import numpy as np
 
-from jast._src.blackbox.answers import Answer, Answers, Failing, keys_of
+from jast._src.blackbox.answers import Answer, Answers, keys_of, part_of
 from jast._src.blackbox.worker import fill
 from jast._src.runtime.host_errors import Log
 
@@ -65,6 +68,7 @@ class Host:
         self.done = Calls(0, 0, 0, 0, 0.0)
         self.answers = Answers(size)
         self.asked_twice: set[bool] = set()  # whether a failure was, and another one
+        self.store: Callable[[list], None] | None = None  # of a checkpoint
         self.differs = False  # the system answered the same history in two ways
         self.lock = threading.Lock()
         # one callable for each kind of answer, as it is part of what a compiled program is known by
@@ -78,6 +82,23 @@ class Host:
 
     def calls(self):
         return self.done
+
+    @contextlib.contextmanager
+    def keep_runs(self, store, name):
+        """A context in which the checkpoint ``store`` keeps each run that had an answer, as the
+        parts of that ``name``; those that it holds already are known from here on.
+        """
+        number = 0
+        while (part := store.get(number, name)) is not None:
+            with self.lock:
+                self.answers.put_part(part, self.starts)
+            number += 1
+        before, numbers = self.store, itertools.count(number)
+        self.store = lambda part: store.put(next(numbers), part, name)
+        try:
+            yield
+        finally:
+            self.store = before
 
     def failing(self):
         """The `Failing` runs so far, each once; of very many the last ones."""
@@ -212,7 +233,7 @@ class Host:
             )
         for i, (kind, message) in sorted(said.items()):
             self.log.add(kind, message, partial(example, i))
-        found = {}
+        found, new = {}, []
         for i, row in enumerate(rows.tolist()):
             answer = Answer(
                 bool(reply.event[i]),
@@ -224,12 +245,16 @@ class Host:
             found[row] = found[keys[row]] = answer
             before = self.answers.get(keys[row])
             if before is None:
+                new.append(i)
                 self.answers.put(keys[row], answer)
-                if answer.event and i not in said:
-                    rows_of = [a[i].copy() for a in x0], [_first_rows(a[i], t[i]) for a in xs]
-                    self.answers.failures.append(Failing(*rows_of, int(t[i])))
             elif i not in said:
                 self._compare(before, answer, partial(example, i))
+        valid = [i for i in new if i not in said]
+        if valid:
+            part = part_of([keys[i] for i in rows[valid]], valid, reply, t, x0, xs)
+            self.answers.put_failing(part, self.starts)
+            if self.store is not None:
+                self.store(part)
         return found
 
     def _compare(self, before, now, example):
@@ -245,9 +270,3 @@ class Host:
                 what = "two distances"
             self.log.add("not deterministic", f"the same disturbances gave {what}", example)
 
-
-def _first_rows(a, t):
-    """``a`` with zeros after its first ``t`` rows."""
-    out = np.zeros_like(a)
-    out[:t] = a[:t]
-    return out

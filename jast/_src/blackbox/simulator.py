@@ -301,7 +301,7 @@ class _Asking:
     def __init__(self, host, function):
         self.host, self.function = host, function
         self.incidents, self.calls = host.incidents, host.calls
-        self.failing, self.workers = host.failing, host.workers
+        self.failing, self.workers, self.keep_runs = host.failing, host.workers, host.keep_runs
         if host.spec.episodic and not host.spec.run:
             self.compare = partial(compare, host)
         if not host.spec.episodic:

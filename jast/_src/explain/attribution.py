@@ -20,6 +20,7 @@ from jast._src.normal_space.episode_point import (
     number_names,
     number_steps,
 )
+from jast._src.runtime.host_errors import runs_on_host
 from jast._src.util import checks, display
 
 if TYPE_CHECKING:
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
 __all__ = ["Attribution", "attribution"]
 
 POINTS = 128  # on the way from the mode to the episode
+HOSTED_BUDGET = 1000  # evaluations of a black box by default
 PRINTED = 10  # disturbances
 
 
@@ -83,6 +85,7 @@ def attribution(
     *,
     key: chex.PRNGKey | None = None,
     permutations: int = 200,
+    budget: int | None = None,
 ) -> Attribution:
     """Which disturbances brought the failure about, and by how much?
 
@@ -101,12 +104,14 @@ def attribution(
         key: of the orders; `jax.random.key(0)` by default.
         permutations: orders, at least 2; each costs as many episodes as there are numbers. Every
             other order is the one before it reversed (antithetic).
+        budget: of "shapley": evaluations at most; there are fewer orders where it affords no more.
+            Default: none; 1000 of a black box.
 
     Returns:
         `Attribution`.
 
     Raises:
-        ValueError: for another method, where the distance has no finite gradient, and where
+        ValueError: for another method, a budget that does not do for two orders, where the distance has no finite gradient, and where
             ``episode`` is not one failure of this simulator.
 
     Example:
@@ -130,6 +135,8 @@ def attribution(
             f"{name}: sim must have a finite miss distance when it is undisturbed, received {quiet}"
         )
     total = float(quiet - g.outcome.distance[0])
+    if method == "shapley":
+        permutations = _affordable(g, permutations, budget)
     values, error, cost = METHODS[method](g, float(quiet), key, permutations)
     x0, shaped = like_disturbances(g.sim, values)
     steps, called = number_steps(g.sim), number_names(g.sim)
@@ -147,6 +154,23 @@ def attribution(
         residual=residual,
         evaluations=g.judge.spent + cost,
     )
+
+
+def _affordable(g: EpisodePoint, permutations: int, budget: int | None) -> int:
+    """So many orders, at most as the ``budget`` affords. ValueError where that is not two."""
+    if budget is None and runs_on_host(g.sim):
+        budget = HOSTED_BUDGET
+    if budget is None:
+        return permutations
+    budget = checks.whole_number("attribution", "budget", budget, 1)
+    each, spent = max(np.count_nonzero(g.v), 1), g.judge.spent + 1  # one run is made twice
+    affordable = (budget - spent) // each // 2 * 2
+    if affordable < 2:
+        raise ValueError(
+            f"attribution: budget must be at least {2 * each + spent}, two orders of {each} numbers,"
+            f" received {budget}"
+        )
+    return min(permutations, affordable)
 
 
 def _shapley(g: EpisodePoint, quiet: float, key: jax.Array, permutations: int):

@@ -21,6 +21,7 @@ import json
 import math
 import os
 import struct
+import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO, NamedTuple, TextIO
@@ -31,6 +32,7 @@ import numpy as np
 
 from jast._src.io import npz, save_load
 from jast._src.io.fingerprint import describe_differences, fingerprint
+from jast._src.runtime.host_errors import sources
 
 if TYPE_CHECKING:
     import chex
@@ -76,7 +78,7 @@ class RecordFile:
 
     def __init__(self, path: str | os.PathLike):
         """OSError where ``path`` cannot be read and written; it is made where there is none."""
-        self._file = open(path, "a+b", buffering=0)
+        self._file, self._lock = open(path, "a+b", buffering=0), threading.Lock()
         self._records = {r.header["name"]: r for r in read_records(path)}
         self._file.truncate(max((r.end for r in self._records.values()), default=0))
 
@@ -91,8 +93,9 @@ class RecordFile:
         if name not in self._records:
             return None
         header, begin, end = self._records[name]
-        self._file.seek(begin)
-        data = self._file.read(end - begin)
+        with self._lock:
+            self._file.seek(begin)
+            data = self._file.read(end - begin)
         return (header, data) if hashlib.sha256(data).hexdigest() == header["sha256"] else None
 
     def put(self, name: str, header: dict[str, Any], data: bytes) -> None:
@@ -100,16 +103,17 @@ class RecordFile:
         header = header | dict(name=name, sha256=hashlib.sha256(data).hexdigest())
         text = json.dumps(header).encode()
         head = HEAD.pack(MARK, len(text), len(data), hashlib.sha256(text).digest())
-        start = self._file.seek(0, os.SEEK_END)
-        try:
-            left = memoryview(head + text + data)
-            while left:
-                left = left[self._file.write(left) :]
-        except BaseException:  # a full disk, or Ctrl-C
-            self._file.truncate(start)
-            raise
-        begin = start + len(head) + len(text)
-        self._records[name] = Record(header, begin, begin + len(data))
+        with self._lock:
+            start = self._file.seek(0, os.SEEK_END)
+            try:
+                left = memoryview(head + text + data)
+                while left:
+                    left = left[self._file.write(left) :]
+            except BaseException:  # a full disk, or Ctrl-C
+                self._file.truncate(start)
+                raise
+            begin = start + len(head) + len(text)
+            self._records[name] = Record(header, begin, begin + len(data))
 
 
 def read_records(path: str | os.PathLike) -> Iterator[Record]:
@@ -200,7 +204,8 @@ def open_checkpoint(
     function: str, folder: str | os.PathLike | None, key: jax.Array, **about: Any
 ) -> Iterator[Checkpoint | None]:
     """A context with the `Checkpoint` of a call, which no other process may use meanwhile; None
-    where ``folder`` is None.
+    where ``folder`` is None. It keeps every finished run of a black box, by its disturbances, and
+    hands it those that it holds: none is made twice.
 
     Args:
         function: the call's name.
@@ -234,7 +239,10 @@ def open_checkpoint(
         _require_same_call(function, folder, fingerprint(function=function, key=key, **about))
         with _name_errors(function, folder):
             parts = stack.enter_context(RecordFile(folder / PARTS))
-        yield Checkpoint(function, folder, parts)
+        checkpoint = Checkpoint(function, folder, parts)
+        for i, source in enumerate(sources(about.get("sim"), "keep_runs")):
+            stack.enter_context(source.keep_runs(checkpoint, f"runs {i}"))
+        yield checkpoint
 
 
 def _require_same_call(function: str, folder: Path, about: dict[str, str]) -> None:

@@ -1,0 +1,287 @@
+"""No run of a black box too many: what each public call runs, counted inside of the system."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import blackboxes
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jast
+from jast import blackbox
+from jast._src.runtime.host_errors import in_full_batches
+from jast.distributions import Normal
+from jast.incidents import incidents
+
+TWICE = 2  # runs that are made twice in the life of a simulator: a failure, and another one
+CALIBRATION = 60  # episodes that scale the reward and the actions of a search, told by its docstring
+
+
+class Counted(blackboxes.Leaves):
+    """Counts its starts: they are its runs."""
+
+    runs = 0
+
+    def initialize(self):
+        super().initialize()
+        Counted.runs += 1
+
+
+def counted(disturbances):
+    Counted.runs += 1
+    away = abs(float(np.sum(disturbances, dtype=np.float64)))
+    return away >= 4.0, max(4.0 - away, 0.0)
+
+
+SYSTEMS = {"function": counted, "steps": Counted}
+
+
+def box(kind="function", horizon=6, **settings):
+    sim = blackbox.from_python(
+        SYSTEMS[kind], horizon=horizon, disturbance=Normal(0.0, 1.0), **settings
+    )
+    Counted.runs = 0  # without the first object, which shows how many numbers it observes
+    return sim
+
+
+def failure(sim, horizon=6):
+    """A failing episode, for which something has run."""
+    episode = jast.replay(sim, jnp.full(horizon, 1.2))
+    assert episode.failure
+    Counted.runs = 0
+    return episode
+
+
+@pytest.mark.parametrize("kind", SYSTEMS)
+def test_nothing_is_run_twice(kind):
+    sim = box(kind)
+    x = jnp.full(6, 0.1)
+    first = jast.replay(sim, x)
+    assert Counted.runs == 1
+    # the first that is asked for again is run again, to see that the answer is the same
+    jast.replay(sim, x)
+    before = Counted.runs
+    assert before <= 1 + TWICE
+    again = jast.replay(sim, x)
+    assert Counted.runs == before and again.distance == first.distance
+    assert blackbox.calls(sim).known > 0
+    # equal rows of a batch are one run
+    jax.vmap(lambda x: jast.replay(sim, x).distance)(jnp.full((5, 6), 0.2))
+    assert Counted.runs == before + 1
+
+
+def test_a_system_that_answers_otherwise_is_no_longer_remembered(key):
+    """It is said after two runs that differ, and from then on every run is made."""
+    draws = iter(range(100))
+    sim = blackbox.from_python(
+        lambda x: (False, float(next(draws))), horizon=2, disturbance=Normal(0.0, 1.0)
+    )
+    found = [float(jast.replay(sim, jnp.ones(2)).distance) for _ in range(4)]
+    assert found == [0, 1, 2, 3]
+    (only,) = incidents(sim)
+    assert only.kind == "not deterministic" and only.message.endswith("gave two distances")
+    assert only.disturbances.tolist() == [1, 1]
+
+
+@pytest.mark.parametrize("kind", SYSTEMS)
+def test_nominal_runs_what_it_was_asked(key, kind):
+    """And the undisturbed episode, which is the one that is made twice."""
+    sim = box(kind)
+    jast.nominal(key, sim, episodes=30)
+    assert 30 < Counted.runs <= 30 + TWICE
+
+
+@pytest.mark.parametrize("kind", SYSTEMS)
+def test_plain_draws_are_counted(key, kind):
+    sim = box(kind)
+    found = jast.estimate.monte_carlo(key, sim, 100)
+    assert found.episodes == 100 and Counted.runs <= 100
+
+
+def test_falsify_runs_what_it_was_asked(key):
+    sim = box()
+    found = jast.search.falsify(key, sim, simulations=100, stop=False)
+    assert found.episodes == 100 and found.settings["batch"] == 10
+    assert Counted.runs <= 100 + TWICE
+
+
+def test_batches_fill_the_workers():
+    """Which are started on first use: here none is."""
+    assert [in_full_batches(box(workers=n), 10) for n in (1, 3, 16)] == [10, 12, 16]
+    assert in_full_batches(box(), 10) == in_full_batches(jast.simulators.walk1d(), 10) == 10
+
+
+def test_what_prints_and_writes_into_its_arrays_is_run_all_the_same(key, capsys):
+    def careless(disturbances):
+        print("a line")
+        answer = counted(disturbances)
+        disturbances[:] = np.nan
+        return answer
+
+    sim = blackbox.from_python(careless, horizon=6, disturbance=Normal(0.0, 1.0))
+    ours, theirs = (jast.estimate.monte_carlo(key, s, 50) for s in (sim, box()))
+    assert ours.failing == theirs.failing > 0 and incidents(sim) == ()
+    assert capsys.readouterr().out.count("a line") == 50
+
+
+SEARCHES = {
+    "monte_carlo": lambda key, sim: jast.search.monte_carlo(key, sim, episodes=300),
+    "chain": lambda key, sim: jast.search.chain(key, sim, episodes=300),
+    "cem": lambda key, sim: jast.search.cem(key, sim, samples=100, elites=10, iterations=3),
+    "go_explore": lambda key, sim: jast.search.go_explore(key, sim, episodes=300),
+    "forest": lambda key, sim: jast.search.forest(key, sim, trees=2, prunes=3, simulations=50),
+    "mcts": lambda key, sim: jast.search.mcts(key, sim, simulations=300),
+}
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("kind", SYSTEMS)
+@pytest.mark.parametrize("name", SEARCHES)
+def test_a_search_runs_its_episodes_and_those_that_scale_it(key, name, kind):
+    sim = box(kind)
+    found = SEARCHES[name](key, sim)
+    # what a search draws again, by another program, may differ in the last digit: the failures
+    # that it archives
+    assert Counted.runs <= 300 + CALIBRATION + TWICE + len(found.failures) // 4
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("kind", SYSTEMS)
+@pytest.mark.parametrize("budget", [300, 1000])
+def test_stress_runs_its_budget_with_all_that_it_does(key, kind, budget):
+    sim = box(kind)
+    report = jast.stress(key, sim, budget)
+    assert Counted.runs == report.episodes <= budget
+    assert report.episodes == sum(report.spent.values())
+    assert "falsify" in report.spent and report.failures.best.failure
+    assert report.probability is not None
+
+
+@pytest.mark.long
+def test_an_estimate_runs_its_budget(key):
+    for budget in (300, 1000):
+        sim = box()
+        jast.estimate.failure_probability(key, sim, budget)
+        assert Counted.runs <= budget
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("kind", SYSTEMS)
+def test_a_refinement_runs_its_budget(key, kind):
+    sim = box(kind)
+    episode = failure(sim)
+    given = jax.tree.map(lambda a: np.asarray(a)[None], episode._replace(states=None))
+    found = jast.search.refine(key, sim, given, budget=500)
+    assert Counted.runs <= 500 and len(found.failures) == 1
+    assert found.failures.best.reward >= episode.reward
+
+
+def test_minimal_runs_its_budget():
+    sim = box()
+    episode = failure(sim)
+    found = jast.explain.minimal(sim, episode, budget=60)
+    assert Counted.runs <= 60 and found.episode.failure and not found.complete
+    assert "budget was used up" in str(found)
+    with pytest.raises(ValueError, match="minimal: budget must be"):
+        jast.explain.minimal(sim, episode, budget=3)
+
+
+@pytest.mark.long
+def test_minimal_says_that_it_is_complete():
+    sim = box()
+    episode = failure(sim)
+    found = jast.explain.minimal(sim, episode, orders=2, budget=5000)
+    assert found.complete and Counted.runs <= found.evaluations + 5
+
+
+def test_criticality_runs_its_budget(key):
+    sim = box()
+    episode = failure(sim)
+    found = jast.explain.criticality(key, sim, episode, budget=100)
+    assert Counted.runs <= 100 and found.draws == (100 - 3) // 7
+    assert found.probability[-1] == 1
+    with pytest.raises(ValueError, match="budget must be at least 10, 1 continuations of 7 states"):
+        jast.explain.criticality(key, sim, episode, budget=5)
+    with pytest.raises(ValueError, match="50 continuations of 7 states"):
+        jast.explain.criticality(key, sim, episode, budget=100, draws=50)
+
+
+@pytest.mark.long
+def test_what_learns_from_failures_runs_its_budget(key):
+    pytest.importorskip("sklearn")
+    sim = box()
+    given = jast.search.monte_carlo(key, sim, episodes=300, refine=0)
+    Counted.runs = 0
+    told = jast.explain.rules(sim, given, budget=1000)
+    assert Counted.runs <= 1000 and told.evaluations <= 1000
+    with pytest.raises(ValueError, match="rules: budget must be at least"):
+        jast.explain.rules(sim, given, budget=100)
+    Counted.runs = 0
+    jast.explain.monitor(sim, given, model="logistic", budget=2000)
+    assert Counted.runs <= 2000
+
+
+def test_attribution_runs_its_budget():
+    sim = box()
+    episode = failure(sim)
+    found = jast.explain.attribution(sim, episode, budget=50)
+    assert Counted.runs <= 50 and found.evaluations <= 50
+    with pytest.raises(ValueError, match="attribution: budget must be at least"):
+        jast.explain.attribution(sim, episode, budget=10)
+
+
+@pytest.mark.long
+def test_a_failing_run_is_never_lost(key):
+    """Whoever makes it: all failing runs of a call are among the failures of its report."""
+    sim = box()
+    report = jast.stress(key, sim, 300, top=1000)
+    host = sim.evaluate.func.host
+    kept = {e.disturbances.tobytes() for e in report.failures}
+    runs = host.failing()
+    assert len(runs) > 10 and {run.xs[0].tobytes() for run in runs} <= kept
+
+
+KILLED = """
+import sys, time
+sys.path.insert(0, {tests!r})
+import jax, jast
+from jast.distributions import Normal
+
+def system(x):
+    with open({log!r}, "a") as file:
+        file.write(x.tobytes().hex() + "\\n")
+    time.sleep(0.02)
+    s = float(abs(x.sum()))
+    return s >= 4.0, max(4.0 - s, 0.0)
+
+sim = jast.blackbox.from_python(system, horizon=6, disturbance=Normal(0.0, 1.0))
+found = jast.search.falsify(
+    jax.random.key(1), sim, simulations=150, batch=5, stop=False, checkpoint={folder!r}
+)
+print(found.episodes, found.failing)
+"""
+
+
+def test_a_killed_search_goes_on_without_running_anything_twice(tmp_path):
+    log, folder = tmp_path / "runs.log", tmp_path / "checkpoint"
+    code = KILLED.format(tests=os.path.dirname(__file__), log=str(log), folder=str(folder))
+    command = [sys.executable, "-c", code]
+    lines = lambda: log.read_text().split() if log.exists() else []
+    first = subprocess.Popen(command)
+    while len(lines()) < 40 and first.poll() is None:
+        time.sleep(0.02)
+    first.send_signal(signal.SIGKILL)
+    first.wait()
+    before = lines()
+    assert 40 <= len(before) < 150
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    episodes, failing = map(int, done.stdout.split())
+    assert episodes == 150 and failing > 0
+    runs = lines()
+    # a batch of 5 that was under way when it was killed, and the two that are made twice
+    assert len(runs) - len(set(runs)) <= 5 + TWICE
