@@ -5,6 +5,9 @@ benchmarks.blackbox [--json] [--quick | --smoke]``.
 loop of batches. ``speedup``: wall time with one worker to that with two, for a system that waits
 for 5 ms and one that computes for as long, in batches of 64; repetitions of the two alternate.
 Medians, with quartiles.
+
+``runs``: of an object of 15 steps, how many runs each call was asked for and how many it made,
+counted inside of the object, with the seconds that the call took in all.
 """
 
 import json
@@ -18,6 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
+import jast
 from benchmarks.sizes import options, print_report, processors, size, timed
 from jast import blackbox
 from jast.distributions import Normal
@@ -40,6 +44,93 @@ def computes(disturbances):
     while time.perf_counter() < end:
         pass
     return trivial(disturbances)
+
+
+class Counted:
+    """A walk that fails 6 away from its start; counts its starts."""
+
+    runs = 0
+
+    def initialize(self):
+        Counted.runs += 1
+        self.at = 0.0
+
+    def transition(self, x):
+        self.at += float(x)
+
+    def is_event(self):
+        return abs(self.at) >= 6.0
+
+    def miss_distance(self):
+        return max(6.0 - abs(self.at), 0.0)
+
+
+KEY = jax.random.key(0)
+FAILING = jnp.full(15, 0.5)
+CALLS = {  # name -> (runs asked for, the call, whether it is in the quick size)
+    "nominal": (30, lambda sim: jast.nominal(KEY, sim, 30), True),
+    "search.falsify": (
+        300,
+        lambda sim: jast.search.falsify(KEY, sim, simulations=300, stop=False),
+        True,
+    ),
+    "estimate.monte_carlo": (300, lambda sim: jast.estimate.monte_carlo(KEY, sim, 300), True),
+    "estimate.failure_probability": (
+        300,
+        lambda sim: jast.estimate.failure_probability(KEY, sim, 300),
+        False,
+    ),
+    "stress": (300, lambda sim: jast.stress(KEY, sim, 300), True),
+    "search.monte_carlo": (
+        300,
+        lambda sim: jast.search.monte_carlo(KEY, sim, episodes=300),
+        False,
+    ),
+    "search.chain": (300, lambda sim: jast.search.chain(KEY, sim, episodes=300), False),
+    "search.cem": (
+        300,
+        lambda sim: jast.search.cem(KEY, sim, samples=100, elites=10, iterations=3),
+        False,
+    ),
+    "search.go_explore": (300, lambda sim: jast.search.go_explore(KEY, sim, episodes=300), False),
+    "search.forest": (
+        300,
+        lambda sim: jast.search.forest(KEY, sim, trees=2, prunes=3, simulations=50),
+        False,
+    ),
+    "search.refine": (
+        1000,
+        lambda sim: jast.search.refine(KEY, sim, jast.replay(sim, FAILING), budget=1000),
+        False,
+    ),
+    "explain.minimal": (
+        500,
+        lambda sim: jast.explain.minimal(sim, jast.replay(sim, FAILING), budget=500),
+        True,
+    ),
+    "explain.criticality": (
+        1000,
+        lambda sim: jast.explain.criticality(KEY, sim, jast.replay(sim, FAILING), budget=1000),
+        True,
+    ),
+    "explain.attribution": (
+        1000,
+        lambda sim: jast.explain.attribution(sim, jast.replay(sim, FAILING), budget=1000),
+        False,
+    ),
+}
+
+
+def runs(every):
+    """By the name of a call: runs asked for and made, and seconds; ``every`` call or a few."""
+    out = {}
+    for name, (asked, call, quick) in CALLS.items():
+        if every or quick:
+            sim = blackbox.from_python(Counted, horizon=15, disturbance=Normal(0.0, 1.0))
+            Counted.runs = 0
+            seconds = wall(call, sim)
+            out[name] = {"asked": asked, "made": Counted.runs, "seconds": round(seconds, 1)}
+    return out
 
 
 def box(system, workers):
@@ -134,6 +225,8 @@ def main(argv=None):
         "speedup": speedup(repeats, 4 if args.smoke else 64)
         | {"two_processes": two_processes(repeats, 2 if args.smoke else 100)},
     }
+    if not args.smoke:
+        report["runs"] = runs(not args.quick)
     print_report(args, report, "\n".join(f"{k}: {json.dumps(v)}" for k, v in report.items()))
 
 

@@ -19,7 +19,7 @@ from jast.distributions import Normal
 from jast.incidents import incidents
 
 TWICE = 2  # runs that are made twice in the life of a simulator: a failure, and another one
-CALIBRATION = 60  # episodes that scale the reward and the actions of a search, told by its docstring
+CALIBRATION = 60  # episodes that scale reward and actions of a search, as its docstring says
 
 
 class Counted(blackboxes.Leaves):

@@ -65,7 +65,6 @@ class Answers:
             del kept[next(iter(kept))]
         kept[key] = answer
 
-
     def put_part(self, part: list[np.ndarray], starts: int) -> None:
         """The answers and failures of a part of a checkpoint (`part_of`)."""
         keys, event, distance, terminal, log_p, seen, *_ = part
@@ -95,9 +94,10 @@ def part_of(
     """
     answers = [a[rows] for a in (reply.event, reply.distance, reply.terminal, reply.log_p)]
     failing = np.array(rows)[reply.event[rows]]
-    behind = np.arange(xs[0].shape[1]) >= t[failing, None] if xs else None
-    kept = [np.where(behind.reshape(*behind.shape, *(1,) * (a.ndim - 2)), 0, a[failing]) for a in xs]
-    kept = [b.astype(a.dtype) for a, b in zip(xs, kept, strict=True)]
+    behind = np.arange(xs[0].shape[1]) >= t[failing, None]
+    kept = [a[failing] for a in xs]  # copies
+    for a in kept:
+        a[behind] = 0
     names = np.frombuffer(b"".join(keys), np.uint8).reshape(len(keys), KEY)
     return [names, *answers, reply.seen[rows], t[failing], *(a[failing] for a in x0), *kept]
 

@@ -69,6 +69,7 @@ class Host:
         self.answers = Answers(size)
         self.asked_twice: set[bool] = set()  # whether a failure was, and another one
         self.store: Callable[[list], None] | None = None  # of a checkpoint
+        self.told: Callable[[int], None] | None = None
         self.differs = False  # the system answered the same history in two ways
         self.lock = threading.Lock()
         # one callable for each kind of answer, as it is part of what a compiled program is known by
@@ -99,6 +100,17 @@ class Host:
             yield
         finally:
             self.store = before
+
+    @contextlib.contextmanager
+    def tell_runs(self, told):
+        """A context in which ``told(failing)`` is called after each batch of runs, with the number
+        of failing ones in it.
+        """
+        before, self.told = self.told, told
+        try:
+            yield
+        finally:
+            self.told = before
 
     def failing(self):
         """The `Failing` runs so far, each once; of very many the last ones."""
@@ -171,7 +183,11 @@ class Host:
         self.done = self.done._replace(
             rows=self.done.rows + len(t), known=self.done.known + len(t) - len(rows)
         )
-        found = [answers.get(i) or answers.get(k) or self.answers.get(k) for i, k in enumerate(keys)]
+        # a batch may hold more than the memory does
+        found = [
+            answers.get(i) or answers.get(key) or self.answers.get(key)
+            for i, key in enumerate(keys)
+        ]
         with np.errstate(over="ignore"):
             distance, log_p = (
                 np.array([getattr(a, name) for a in found]).astype(dtype)
@@ -180,7 +196,8 @@ class Host:
         event, terminal = (
             np.array([getattr(a, name) for a in found], bool) for name in ("event", "terminal")
         )
-        seen = np.frombuffer(b"".join(a.seen for a in found), np.float64).reshape(len(t), self.size).astype(dtype)
+        seen = np.frombuffer(b"".join(a.seen for a in found), np.float64)
+        seen = seen.reshape(len(t), self.size).astype(dtype)
         wrong = ~np.isfinite(distance)  # too large for the dtype, too
         distance[wrong], log_p[wrong] = np.nan, 0
         return event & ~wrong, distance, terminal | wrong, log_p, seen
@@ -255,18 +272,19 @@ class Host:
             self.answers.put_failing(part, self.starts)
             if self.store is not None:
                 self.store(part)
+        if self.told is not None:
+            self.told(int(reply.event[valid].sum()))
         return found
 
     def _compare(self, before, now, example):
         """An incident where the same input had another answer before; from then on nothing is
         answered from memory.
         """
-        if before.distance != now.distance or (before.event, before.log_p) != (now.event, now.log_p):
-            self.differs = True
-            what = "two values of log p"
-            if before.event != now.event:
-                what = "a failure and no failure"
-            elif before.distance != now.distance:
-                what = "two distances"
-            self.log.add("not deterministic", f"the same disturbances gave {what}", example)
-
+        names = dict(
+            event="a failure and no failure", distance="two distances", log_p="two values of log p"
+        )
+        for field, what in names.items():
+            if getattr(before, field) != getattr(now, field):
+                self.differs = True
+                self.log.add("not deterministic", f"the same disturbances gave {what}", example)
+                return

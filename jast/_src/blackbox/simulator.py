@@ -134,6 +134,14 @@ def from_python(
     search: see `jast.incidents.incidents`. Outcomes have no gradient: NaN. A simulator is known by
     its identity: make it once.
 
+    No run is made twice: answers are kept by their disturbances for as long as there is the
+    simulator (128 MB of them at most), and with ``checkpoint=`` of a call in its folder. Only the
+    first failure that is asked for again is run again, and the first other episode. Where that is
+    answered otherwise the system is not deterministic: an incident says so, and from then on all
+    runs are made. So a call runs no more often than its ``budget`` or ``episodes``; what comes on
+    top (these two, the undisturbed episode of `jast.nominal`, the episodes that scale the reward of
+    a search) is in its docstring.
+
     Args:
         system: see above.
         horizon: disturbances of an episode.
@@ -301,7 +309,8 @@ class _Asking:
     def __init__(self, host, function):
         self.host, self.function = host, function
         self.incidents, self.calls = host.incidents, host.calls
-        self.failing, self.workers, self.keep_runs = host.failing, host.workers, host.keep_runs
+        self.failing, self.workers = host.failing, host.workers
+        self.keep_runs, self.tell_runs = host.keep_runs, host.tell_runs
         if host.spec.episodic and not host.spec.run:
             self.compare = partial(compare, host)
         if not host.spec.episodic:

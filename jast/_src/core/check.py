@@ -311,8 +311,8 @@ class _Probe(NamedTuple):
 
 @quick
 def _probe(sim, actions):
-    """LANES nominal episodes (HOSTED_LANES) and the undisturbed one, STEPS steps of each (all, of an episodic
-    system).
+    """LANES nominal episodes (HOSTED_LANES) and the undisturbed one, STEPS steps of each (all, of
+    an episodic system).
     """
     about = outline(sim)
     has_mode = about.start.mode and about.disturbance.mode

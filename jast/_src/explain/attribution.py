@@ -111,8 +111,8 @@ def attribution(
         `Attribution`.
 
     Raises:
-        ValueError: for another method, a budget that does not do for two orders, where the distance has no finite gradient, and where
-            ``episode`` is not one failure of this simulator.
+        ValueError: for another method, a budget that does not do for two orders, where the distance
+            has no finite gradient, and where ``episode`` is not one failure of this simulator.
 
     Example:
         >>> import jax.numpy as jnp, jast
@@ -167,8 +167,8 @@ def _affordable(g: EpisodePoint, permutations: int, budget: int | None) -> int:
     affordable = (budget - spent) // each // 2 * 2
     if affordable < 2:
         raise ValueError(
-            f"attribution: budget must be at least {2 * each + spent}, two orders of {each} numbers,"
-            f" received {budget}"
+            f"attribution: budget must be at least {2 * each + spent}, two orders of {each}"
+            f" numbers, received {budget}"
         )
     return min(permutations, affordable)
 

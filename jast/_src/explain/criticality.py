@@ -174,8 +174,8 @@ def _affordable_draws(budget: int | None, draws: int | None, steps: int) -> int:
     affordable = min((budget - last) // states, DRAWS)
     if affordable < least:
         raise ValueError(
-            f"criticality: budget must be at least {states * least + last}, {least} continuations of"
-            f" {states} states, received {budget}"
+            f"criticality: budget must be at least {states * least + last}, {least} continuations"
+            f" of {states} states, received {budget}"
         )
     return affordable if draws is None else draws
 

@@ -261,9 +261,7 @@ def _episodes(name, key, sim, failures, others, episodes, budget):
         cases = given_cases(name, sim, failures, others, None, EPISODES)
         return cases.episodes, cases.kind, cases.group, 0
     own, calm = jax.random.split(key)
-    cases = simulate_cases(
-        name, own, sim, failures, None, episodes, budget=budget, after=AFTER
-    )
+    cases = simulate_cases(name, own, sim, failures, None, episodes, budget=budget, after=AFTER)
     episodes = cases.asked
     plain = draw_ordinary(calm, sim, episodes)
     n = len(plain.length)

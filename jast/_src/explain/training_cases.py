@@ -58,8 +58,8 @@ def simulate_cases(
         episodes = min(episodes, (budget - spent) // each)
         if episodes < 2 * DISTINCT:
             raise ValueError(
-                f"{function}: budget must be at least {spent + 2 * DISTINCT * each}, {each} evaluations"
-                f" for each of {2 * DISTINCT} failures, received {budget}"
+                f"{function}: budget must be at least {spent + 2 * DISTINCT * each}, {each}"
+                f" evaluations for each of {2 * DISTINCT} failures, received {budget}"
             )
     v = draw_variants(key, sim, seeds, episodes)
     if len(v.label) < 2 * DISTINCT:

@@ -4,6 +4,7 @@ raised, so that a search goes on.
 
 from __future__ import annotations
 
+import contextlib
 import threading
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -26,6 +27,7 @@ __all__ = [
     "runs_made",
     "runs_on_host",
     "sources",
+    "telling_runs",
 ]
 
 GROUPS = 100  # different messages that a `Log` keeps apart at most: each has an example
@@ -144,6 +146,17 @@ def runs_made(sim):
 def failing_runs(sim):
     """The runs of a black box that failed so far, each once, as its workplace keeps them."""
     return [run for source in sources(sim, "failing") for run in source.failing()]
+
+
+@contextlib.contextmanager
+def telling_runs(sim, told):
+    """A context in which ``told(failing)`` is called after each batch of runs of a black box, with
+    the number of failing ones in it.
+    """
+    with contextlib.ExitStack() as stack:
+        for source in sources(sim, "tell_runs"):
+            stack.enter_context(source.tell_runs(told))
+        yield
 
 
 def in_full_batches(sim, least):

@@ -34,7 +34,7 @@ from jast._src.normal_space import transform
 from jast._src.runtime import work
 from jast._src.runtime._jax import briefly
 from jast._src.runtime.checkpoints import keep_answers, open_checkpoint
-from jast._src.runtime.host_errors import failing_runs, runs_made, runs_on_host
+from jast._src.runtime.host_errors import failing_runs, runs_made, runs_on_host, telling_runs
 from jast._src.runtime.progress_bar import Watch
 from jast._src.search.refine.modes import Mode, Modes, modes, spread
 from jast._src.search.refine.refine import refine
@@ -170,7 +170,8 @@ def stress(
         callback: called as ``callback(done, total, None)`` after every piece of the work.
         checkpoint: a folder that keeps finished populations and what the system answered to
             searches, refinement and draws. The same call, with its ``budget``, then goes on where
-            it was stopped, to the same result; first looks run again.
+            it was stopped, to the same result; first looks run again, unless it is a black box,
+            of which every finished run is kept.
         executor: runs the parts of the probability: anything with ``submit(function, *args)``, such
             as the executors of `concurrent.futures` and Dask's client. It changes no result.
         devices: some of `jax.devices()`, one thread each, likewise (docs/scale.md).
@@ -218,13 +219,14 @@ def stress(
             test.made, test.known = begun
             test.note("check", 0)
         try:
-            test.run_nominal()
-            if test.cheap:
-                test.run_populations()
-            else:
-                test.search()
-                test.refine()
-                test.estimate()
+            with telling_runs(sim, test.tell_runs):
+                test.run_nominal()
+                if test.cheap:
+                    test.run_populations()
+                else:
+                    test.search()
+                    test.refine()
+                    test.estimate()
         except KeyboardInterrupt:
             if test.nominal is None:
                 raise
@@ -258,6 +260,7 @@ class _StressTest:
         self.has_points = has_quantiles(sim)
         large = (1 - sum(LARGE_SHARES)) * budget >= MIN_ESTIMATE_BUDGET
         self.hosted, self.made, self.known = runs_on_host(sim), 0, 0
+        self.failing_runs = 0
         self.cheap = self.has_points and budgets.uses_populations(sim, budget)
         shares = COUNTING_SHARES
         if self.has_points:
@@ -285,6 +288,12 @@ class _StressTest:
         self.invalid += int(invalid)
         self.watch.reach(min(self.spent, self.budget))
         self.watch.tell()
+
+    def tell_runs(self, failing: int) -> None:
+        """The bar moves with every batch of runs of a black box."""
+        self.failing_runs += failing
+        done = self.spent + runs_made(self.sim) - self.made
+        self.watch.reach(min(done, self.budget), failures=self.failing_runs)
 
     def affordable(self, evaluations: int) -> int:
         """``evaluations``, of a black box at most those that it may still run before its
@@ -475,7 +484,8 @@ class _StressTest:
         rest = max(rest, few_calls.LEAST)
         p = failure_probability(self.next_key(), self.sim, rest, failures=failures, **places)
         self.keep_probability(p, "probability")
-        if p.proposal is None or self.hosted and self.budget - self.spent < shares_cost(self.budget):
+        short = self.hosted and self.budget - self.spent < shares_cost(self.budget)
+        if p.proposal is None or short:
             return
         if not len(self.pool):
             self.redraw_failures(p.proposal)
