@@ -246,6 +246,22 @@ def test_a_failing_run_is_never_lost(key):
     assert len(runs) > 10 and {run.xs[0].tobytes() for run in runs} <= kept
 
 
+@pytest.mark.long
+def test_a_report_says_what_went_wrong(key):
+    def broken(x):
+        if x[0] > 1.5:
+            raise RuntimeError("no solution")
+        return counted(x)
+
+    Counted.runs = 0
+    sim = blackbox.from_python(broken, horizon=6, disturbance=Normal(0.0, 1.0))
+    report = jast.stress(key, sim, 300)
+    (only,) = incidents(sim)
+    assert only.disturbances[0] > 1.5 and only.count > 1
+    assert f"went wrong   {only.count} x raised RuntimeError: no solution" in str(report)
+    assert Counted.runs <= 300
+
+
 KILLED = """
 import sys, time
 sys.path.insert(0, {tests!r})

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jast._src.estimate.estimate import guaranteed_words, is_doubtful
+from jast._src.runtime.host_errors import incidents
 
 __all__ = [
     "advice",
@@ -22,6 +23,9 @@ __all__ = [
 UNRELIABLE_BADGE = "UNRELIABLE: believe plain draws only"
 MAX_RESIDUAL = 0.05
 """Residual below which a failure is called locally likeliest. A convention."""
+
+SHOWN_INCIDENTS = 3
+"""Kinds of what went wrong in a black box that are shown."""
 
 
 class Belief(NamedTuple):
@@ -177,6 +181,8 @@ def verdict_rows(r: Any) -> list[tuple[str, str]]:
     rows.append(("likeliest", text))
     if r.invalid:
         rows.append(("invalid", f"{r.invalid} episodes gave numbers that are not finite"))
+    if r.sim is not None:  # of a black box: their disturbances are in jast.incidents.incidents
+        rows += [("went wrong", str(incident)) for incident in incidents(r.sim)[:SHOWN_INCIDENTS]]
     if "interrupted" in r.settings:
         rows.append(("interrupted", r.settings["interrupted"]))
     return rows

@@ -115,7 +115,7 @@ def refine(
         key: consumed.
         sim: the simulator; its disturbances have quantile functions.
         failures: an archive (`jast.failures`), or a batch of failing episodes.
-        budget: evaluations, at least 100.
+        budget: evaluations, at least 100; a black box never runs more often.
         gradients: differentiate through the simulator; a system on the host, and one whose miss
             distance is flat, has its slopes told from differences.
         checkpoint: a folder that keeps what the system answered. The same call then goes on where
