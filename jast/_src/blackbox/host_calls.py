@@ -175,7 +175,8 @@ class Host:
         (`_in_doubt`), the system is asked, once each.
         """
         keys = keys_of(x0, xs, t)
-        rows = self._to_run(keys, t)
+        known = [self.answers.get(key) for key in keys]
+        rows = self._to_run(keys, known, t)
         if len(rows):
             answers = self._run(keys, rows, lanes, t, x0, xs, dtype)
         else:
@@ -183,11 +184,7 @@ class Host:
         self.done = self.done._replace(
             rows=self.done.rows + len(t), known=self.done.known + len(t) - len(rows)
         )
-        # a batch may hold more than the memory does
-        found = [
-            answers.get(i) or answers.get(key) or self.answers.get(key)
-            for i, key in enumerate(keys)
-        ]
+        found = [answers.get(i) or answers.get(keys[i]) or a for i, a in enumerate(known)]
         with np.errstate(over="ignore"):
             distance, log_p = (
                 np.array([getattr(a, name) for a in found]).astype(dtype)
@@ -202,15 +199,14 @@ class Host:
         distance[wrong], log_p[wrong] = np.nan, 0
         return event & ~wrong, distance, terminal | wrong, log_p, seen
 
-    def _to_run(self, keys, t):
+    def _to_run(self, keys, known, t):
         """The rows [m] of which the system is asked."""
         if self.differs:
             return np.arange(len(keys))
         first, twice = {}, []
-        for i, key in enumerate(keys):
-            before = self.answers.get(key)
+        for i, before in enumerate(known):
             if before is None:
-                first.setdefault(key, i)
+                first.setdefault(keys[i], i)
             elif self._in_doubt(before, t[i]):
                 self.asked_twice.add(before.event)
                 twice.append(i)
