@@ -38,6 +38,7 @@ from jast._src.search.lanes import Tally, distinct_episodes, play_lanes
 from jast._src.search.refine.final import default_share, with_refine_share
 from jast._src.search.result import Trials
 from jast._src.search.setup import prepare
+from jast._src.util.pytrees import map_in_lanes
 
 if TYPE_CHECKING:
     import chex
@@ -196,7 +197,7 @@ def monte_carlo(
     found, noted = ran.state
     log = log_of(noted, work.describe_missing("episodes", ran, noted.tally.episodes, episodes))
     numbers = np.concatenate([found.number[None], found.top.number])
-    rebuilt = jax.device_get(_rebuild(*parts, numbers))
+    rebuilt = jax.device_get(_rebuilt(parts, numbers))
     n = int((found.top.reward > -np.inf).sum())
     best, failing = (jax.tree.map(lambda a, i=i: a[i], rebuilt) for i in (0, slice(1, n + 1)))
     numbers, counts = found.top.number[:n], found.top.count[:n]
@@ -225,10 +226,18 @@ def _unit(job, number, post):
     """Chunk ``number``: (`Found`, `Tally`, `Trials` or None)."""
     begin = number * job.stride
     end = min(begin + job.stride, job.episodes)
-    about = job.key, job.sim, job.reward, job.actions, job.nothing, begin, end, job.lanes
+    about = job.key, job.sim, job.reward, job.actions
+    if runs_on_host(job.sim):
+        at = begin + np.arange(job.lanes, dtype=np.int32)
+        live = at < end
+        played = _recorded(*about, at, live)
+        found, tally = _summed(job.nothing, at, live, played)
+    elif job.record:
+        found, tally, played = _block(*about, job.nothing, begin, end, job.lanes)
+    else:
+        return *_chunk(*about, job.nothing, begin, end, job.lanes), None
     if not job.record:
-        return *_chunk(*about), None
-    found, tally, played = _block(*about)
+        return found, tally, None
     return found, tally, jax.tree.map(lambda a: a[: end - begin, None], played.trials())
 
 
@@ -302,6 +311,12 @@ def _block(key, sim, reward, actions, found, begin, end, lanes):
     number = begin + jnp.arange(lanes, dtype=jnp.int32)
     live = (number < end) & (number >= begin)
     played = _play(key, sim, reward, actions, number, live)
+    return *_summed(found, number, live, played), played
+
+
+@jax.jit
+def _summed(found, number, live, played):
+    """``found`` with the ``live`` ones of episodes of these numbers, and their `Tally`."""
     e = played.episode
     failing, value = live & e.failure, jnp.where(live, e.reward, -jnp.inf)
     any_failure = jnp.any(failing)
@@ -309,7 +324,7 @@ def _block(key, sim, reward, actions, found, begin, end, lanes):
     rewards = jnp.where(failing, value, -jnp.inf)
     top = Top(rewards, played.tag, number, jnp.ones_like(number))
     found = _merged(found, Found(any_failure, value[i], number[i], top))
-    return found, Tally.of(played, live, number), played
+    return found, Tally.of(played, live, number)
 
 
 def _play(key, sim, reward, actions, number, live, **how):
@@ -322,6 +337,23 @@ def _play(key, sim, reward, actions, number, live, **how):
         return actions.draw(key, dist)
 
     return play_lanes(sim, reward, keys, draw_start, draw, live, **how)
+
+
+@jit
+def _recorded(key, sim, reward, actions, number, live):
+    """`Played` with their disturbances."""
+    return _play(key, sim, reward, actions, number, live, record=True)
+
+
+def _rebuilt(parts, numbers):
+    """The episodes of these ``numbers`` [m], with their disturbances. Those of a black box are
+    drawn by the program that drew them first: what another one draws may differ in the last digit,
+    and would have to run.
+    """
+    if not runs_on_host(parts[1]):
+        return _rebuild(*parts, numbers)
+    every = np.ones(HOSTED_LANES, bool)
+    return map_in_lanes(HOSTED_LANES, lambda n: _recorded(*parts, n, every).episode, numbers)
 
 
 @quick
