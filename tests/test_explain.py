@@ -91,7 +91,8 @@ def test_minimal_of_a_black_box_counts_its_calls():
     m = explain.minimal(sim, e, orders=1)
     assert [(step, name) for step, name, *_ in m.parts] == [(3, "gust")]
     assert float(m.episode.disturbances["gust"][2]) == pytest.approx(3, abs=0.01)
-    assert m.evaluations < len(calls) < m.evaluations + 10
+    # of points that come by more than once one is run; the answer is played, replayed and checked
+    assert m.evaluations - 20 < len(calls) <= m.evaluations + 3
 
 
 def test_criticality_of_a_walk(key):

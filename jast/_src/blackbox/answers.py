@@ -13,7 +13,7 @@ import numpy as np
 
 from jast._src.blackbox.worker import Reply, history
 
-__all__ = ["Answer", "Answers", "Failing", "keys_of", "part_of"]
+__all__ = ["Answer", "Answers", "keys_of", "part_of"]
 
 HELD = 2**26
 """Bytes that answers may take, those of failures and those of others each; then the oldest goes."""
