@@ -11,7 +11,7 @@ from jast._src.core.simulator import Simulator
 from jast._src.estimate.tilts.tilts import Tilts
 from jast._src.explain.criticality import Criticality, criticality
 from jast._src.explain.eigenfailures import Eigenfailures, eigenfailures
-from jast._src.explain.minimal import Minimal, minimal
+from jast._src.explain.minimal import MIN_HOSTED_BUDGET, Minimal, minimal
 from jast._src.runtime.host_errors import runs_on_host
 from jast._src.search.refine.modes import Mode
 from jast._src.util import checks
@@ -67,7 +67,7 @@ def cards(
     for i, mode in enumerate(chosen):
         each = budget // len(chosen)
         found: list[Minimal | Criticality | Eigenfailures] = [
-            minimal(sim, mode.failure, budget=each // 2)
+            minimal(sim, mode.failure, budget=max(each // 2, MIN_HOSTED_BUDGET))
         ]
         draws = min(each // 2 // (int(mode.failure.length) + 1), 1000)
         if draws >= CONTINUATIONS:

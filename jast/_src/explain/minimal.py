@@ -21,7 +21,7 @@ from jast._src.runtime.host_errors import runs_on_host
 from jast._src.util import display
 from jast._src.util.checks import number, whole_number
 
-__all__ = ["Minimal", "minimal"]
+__all__ = ["MIN_HOSTED_BUDGET", "Minimal", "minimal"]
 
 SECTIONS = 31  # places between two ends that are looked at together
 SWEEPS = 3  # rounds of shrinking one number after the other
