@@ -199,15 +199,19 @@ def test_minimal_says_that_it_is_complete():
     assert found.complete and Counted.runs <= found.evaluations + 5
 
 
-def test_criticality_runs_its_budget(key):
-    sim = box()
+@pytest.mark.parametrize("kind", SYSTEMS)
+def test_criticality_runs_its_budget(key, kind):
+    """Continuations that end early are not played on."""
+    sim = box(kind)
     episode = failure(sim)
+    states = int(episode.length) + 1
     found = jast.explain.criticality(key, sim, episode, budget=100)
-    assert Counted.runs <= 100 and found.draws == (100 - 3) // 7
+    assert Counted.runs <= 100 and found.draws == (100 - 3) // states
     assert found.probability[-1] == 1
-    with pytest.raises(ValueError, match="budget must be at least 10, 1 continuations of 7 states"):
+    said = f"budget must be at least {states + 3}, 1 continuations of {states} states"
+    with pytest.raises(ValueError, match=said):
         jast.explain.criticality(key, sim, episode, budget=5)
-    with pytest.raises(ValueError, match="50 continuations of 7 states"):
+    with pytest.raises(ValueError, match=f"50 continuations of {states} states"):
         jast.explain.criticality(key, sim, episode, budget=100, draws=50)
 
 

@@ -19,6 +19,7 @@ from jast._src.core.signature import outline
 from jast._src.core.simulator import Simulator, require_simulator
 from jast._src.core.transition import advance, begin, conclude
 from jast._src.runtime._jax import is_traced, quick
+from jast._src.runtime.host_errors import runs_on_host
 from jast._src.util import display
 from jast._src.util.checks import check_random_key
 from jast._src.util.pytrees import conform, pad_rows, select, zero_where
@@ -211,12 +212,17 @@ def play_chosen(
     """The episode of at most ``steps`` steps in which ``choose(state, t, rows[t])`` gives the
     disturbances.
     """
-    first = begin(sim, reward, x0, last=steps <= 0)
+    first, hosted = begin(sim, reward, x0, last=steps <= 0), runs_on_host(sim)
 
     def body(before, at):
         t, row = at
-        # an ended lane goes on from the start state, so that no NaN reaches a gradient
-        safe = before._replace(state=select(before.done, first.state, before.state))
+        # an ended lane goes on from the start state, so that no NaN reaches a gradient; of a state
+        # of zeros no black box is asked
+        if hosted:
+            state = zero_where(before.done, before.state)
+        else:
+            state = select(before.done, first.state, before.state)
+        safe = before._replace(state=state)
         x = choose(safe.state, t, row)
         after = advance(sim, reward, safe, x, t + 1 >= steps)
         kept = select(before.done, before, after)
