@@ -1,10 +1,24 @@
-"""Tables of evenly spaced places, read between their rows."""
+"""Tables of evenly spaced places: read from a file, and between their rows."""
 
+import json
+from pathlib import Path
 from typing import Any
 
 import jax.numpy as jnp
+import numpy as np
 
-__all__ = ["along"]
+__all__ = ["along", "read"]
+
+
+def read(name: str) -> dict[str, Any]:
+    """What is in the JSON file ``name`` beside this one; its lists are arrays of float64."""
+    return _arrays(json.loads(Path(__file__).with_name(name).read_text(encoding="utf-8")))
+
+
+def _arrays(given: Any) -> Any:
+    if isinstance(given, dict):
+        return {name: _arrays(value) for name, value in given.items()}
+    return np.array(given, np.float64)
 
 
 def along(table: Any, place: Any) -> Any:

@@ -34,7 +34,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from jast._src.simulators.arch._table import along
+from jast._src.simulators.arch._table import along, read
 
 __all__ = ["DT", "DURATION", "INPUTS", "Transmission", "drive", "observe", "start"]
 
@@ -64,7 +64,6 @@ def _evenly_spaced(step: float, at: Any, values: Any) -> np.ndarray:
     """A table of numbers [n, ...] at the places ``at`` [n], as one of even spacing: all places are
     multiples of ``step``, from the first on.
     """
-    values = np.asarray(values, np.float64)
     grid = np.arange(round((at[-1] - at[0]) / step) + 1) * step + at[0]
     columns = values.reshape(len(at), -1).T
     return np.stack([np.interp(grid, at, c) for c in columns], axis=1).reshape(
@@ -72,49 +71,15 @@ def _evenly_spaced(step: float, at: Any, values: Any) -> np.ndarray:
     )
 
 
-# ft lb, by throttle (rows) and engine speed, 800, 1200, .. 4800 rpm
-TORQUE = _evenly_spaced(
-    10,
-    [0, 20, 30, 40, 50, 60, 70, 80, 90, 100],
-    [
-        [-40, -44, -49, -53, -57, -61, -65, -70, -74, -78, -82],
-        [215, 117, 85, 66, 44, 29, 10, -2, -13, -22, -32],
-        [245, 208, 178, 148, 122, 104, 85, 66, 48, 33, 18],
-        [264, 260, 241, 219, 193, 167, 152, 133, 119, 96, 85],
-        [264, 279, 282, 275, 260, 238, 223, 208, 189, 171, 152],
-        [267, 290, 293, 297, 290, 275, 260, 256, 234, 212, 193],
-        [267, 297, 305, 305, 305, 301, 293, 282, 267, 249, 226],
-        [267, 301, 308, 312, 319, 323, 319, 316, 297, 279, 253],
-        [267, 301, 312, 319, 327, 327, 327, 327, 312, 293, 267],
-        [267, 301, 312, 319, 327, 334, 334, 334, 319, 305, 275],
-    ],
-)
-# capacity K and torque ratio, by speed ratio
-CONVERTER = _evenly_spaced(
-    0.01,
-    [0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, *np.arange(80, 91) / 100, 0.92, 0.94],
-    np.transpose([
-        [137.4652, 137.0650, 135.8644, 135.6644, 137.5653, 140.3666, 145.2689, 152.8725, 162.9773,
-         164.2779, 166.1788, 167.9797, 170.0807, 172.7820, 175.3832, 179.5852, 183.5871, 189.8901,
-         197.6938, 215.9024, 244.5160],
-        [2.232, 2.075, 1.975, 1.846, 1.72, 1.564, 1.409, 1.254, 1.096, 1.08, 1.061, 1.043, 1.028,
-         1.012, 1.002, 1.002, 1.001, 0.998, 0.999, 1.001, 1.002],
-    ]),
-)  # fmt: skip
-# mph, by throttle (rows) and gear: above the first a shift up, below the second a shift down
-NEVER = 1e6
-UP = _evenly_spaced(
-    5,
-    [0, 25, 35, 50, 90, 100],
-    np.transpose([[10, 10, 15, 23, 40, 40], [30, 30, 30, 41, 70, 70], [50, 50, 50, 60, 100, 100],
-                  [NEVER] * 6]),
-)  # fmt: skip
-DOWN = _evenly_spaced(
-    5,
-    [0, 5, 40, 50, 90, 100],
-    np.transpose([[0] * 6, [5, 5, 5, 5, 30, 30], [20, 20, 25, 30, 50, 50],
-                  [35, 35, 40, 50, 80, 80]]),
-)  # fmt: skip
+_TABLES = read("transmission.json")
+TORQUE = _evenly_spaced(10, **_TABLES["torque"])
+"""ft lb, by throttle (rows) and engine speed, 800, 1200, .. 4800 rpm."""
+CONVERTER = _evenly_spaced(0.01, **_TABLES["converter"])
+"""Capacity K and torque ratio, by speed ratio."""
+UP = _evenly_spaced(5, **_TABLES["up"])
+"""mph, by throttle (rows) and gear: above it a shift up, from the fourth never."""
+DOWN = _evenly_spaced(5, **_TABLES["down"])
+"""mph: below it a shift down."""
 
 
 class Transmission(NamedTuple):
