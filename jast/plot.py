@@ -22,10 +22,6 @@ from jast._src.plot.cross_entropy import convergence, proposal_contours, surroga
 from jast._src.plot.episodes import distances, disturbances, history
 from jast._src.plot.exceedance import exceedance
 from jast._src.plot.failing_inputs import contributions, first_failures
-
-# their earlier names
-from jast._src.plot.failing_inputs import contributions as influence  # noqa: F401
-from jast._src.plot.failing_inputs import first_failures as failure_grid  # noqa: F401
 from jast._src.plot.failure_fan import failure_fan
 from jast._src.plot.ferry import ferry
 from jast._src.plot.fms import fms

@@ -15,7 +15,6 @@ from systems import dice, ring
 
 import jast
 from jast import plot
-from jast._src.plot import style
 from jast.distributions import Joint, MultivariateNormalDiag, Normal
 
 FERRY = jast.simulators.ferry()
@@ -154,18 +153,3 @@ def test_settings_of_matplotlib_are_left_alone():
 def test_pictures_are_on_the_door_without_matplotlib():
     code = "import sys, jast; jast.plot.history; sys.exit('matplotlib' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code]).returncode == 0
-
-
-def test_the_former_order_of_arguments_warns():
-    seen = []
-
-    @style.result_first
-    def picture(samples, sim, value=None):
-        seen.append((samples, sim, value))
-
-    sim = jast.simulators.walk1d()
-    picture("a", sim, 1)
-    picture("b", sim=sim)
-    with pytest.warns(DeprecationWarning, match=r"plot.picture: the order is \(result, sim\) now"):
-        picture(sim, "c", value=2)
-    assert seen == [("a", sim, 1), ("b", sim, None), ("c", sim, 2)]

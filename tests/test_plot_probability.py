@@ -268,8 +268,6 @@ def test_a_fan_of_an_archive_and_its_labels():
     assert named.get_ylabel() == "wind speed"
     unnamed = plot.failure_fan(archive, WALK, lambda s: s)
     assert unnamed.get_ylabel() == "number of the state"
-    with pytest.warns(DeprecationWarning, match="failure_fan: the order is"):
-        plot.failure_fan(WALK, archive)
 
 
 def curve(u, p, reliable=True):

@@ -28,7 +28,6 @@ if TYPE_CHECKING:
 __all__ = ["failure_fan"]
 
 
-@style.result_first
 def failure_fan(
     samples: Any,
     sim: Simulator | None = None,

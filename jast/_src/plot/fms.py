@@ -33,7 +33,6 @@ QUESTIONED = dict(color=style.VERMILION, linewidth=2.6)  # the arc in question
 UNITS = {"arc length": "", "kink": " rad", "disconnection": " ft", "course": " rad"}
 
 
-@style.result_first
 def fms(episode: Episode, sim: Simulator, axes: Sequence[Axes] | None = None) -> list[Axes]:
     """One `Episode` of an fms simulator: the route on a map (left; degrees), and the turn with the
     largest error of its arc, enlarged (right; nmi from its waypoint). Where the defect acted, it is

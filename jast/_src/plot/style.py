@@ -1,8 +1,5 @@
 """What the pictures share: colours, settings of matplotlib, panels, and what is drawn in many."""
 
-import functools
-import warnings
-from collections.abc import Callable
 from contextlib import contextmanager
 from io import BytesIO
 from operator import index
@@ -12,7 +9,6 @@ from typing import Any
 import numpy as np
 
 from jast._src.core.episode import Episode
-from jast._src.core.simulator import Simulator
 
 __all__ = [
     "BLUE",
@@ -48,7 +44,6 @@ __all__ = [
     "one_episode",
     "panels",
     "plain",
-    "result_first",
     "shade",
     "styled",
     "unframed",
@@ -185,25 +180,6 @@ def checked_iterations(caller, given, default, run):
     if not chosen:
         raise ValueError(f"plot.{caller}: iterations must name at least one, received none")
     return chosen
-
-
-def result_first(picture: Callable[..., Any]) -> Callable[..., Any]:
-    """A picture of (result, sim, ...) that also takes the order of earlier versions, (sim, result,
-    ...), with a DeprecationWarning.
-    """
-
-    @functools.wraps(picture)
-    def either(*args: Any, **named: Any) -> Any:
-        if len(args) > 1 and isinstance(args[0], Simulator):
-            text = (
-                f"plot.{picture.__name__}: the order is (result, sim) now; (sim, result) goes with"
-                " the next version"
-            )
-            warnings.warn(text, DeprecationWarning, stacklevel=2)
-            args = (args[1], args[0], *args[2:])
-        return picture(*args, **named)
-
-    return either
 
 
 def plain(text):

@@ -36,7 +36,6 @@ PANELS = 8  # that are drawn where nobody chooses
 BANDS = ((0.05, 0.95, 0.15), (0.25, 0.75, 0.35))  # quantiles and opacity
 
 
-@style.result_first
 def traces(
     samples: Any,
     sim: Simulator | None = None,
@@ -146,7 +145,6 @@ def _bands(ax: Any, rows: np.ndarray, n: int) -> None:
         style.band(ax, at, *edges, color=style.GREY, alpha=alpha, label=label)
 
 
-@style.result_first
 def phase(
     samples: Any,
     sim: Simulator | None = None,

@@ -6,25 +6,18 @@
 
 import importlib
 import sys
-import warnings
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 __all__ = ["door", "dir_function"]
 
 
-def door(
-    package: str,
-    lazy: Mapping[str, str] | None = None,
-    renamed: Mapping[str, str] | None = None,
-) -> Callable[[str], Any]:
+def door(package: str, lazy: Mapping[str, str]) -> Callable[[str], Any]:
     """The ``__getattr__`` of ``package``.
 
     Args:
         package: the package's ``__name__``.
         lazy: name -> where it is, as "module" or "module:attribute"; looked up once, at first use.
-        renamed: name of an earlier version -> where it is now; each use warns. These go with the
-            next version.
 
     Returns:
         A function of a name: the thing of that name.
@@ -32,18 +25,12 @@ def door(
     Raises:
         AttributeError: from the function, for any other name.
     """
-    lazy, renamed = dict(lazy or {}), dict(renamed or {})
 
     def getattribute(name: str) -> Any:
         if name in lazy:
             value = _found(lazy[name])
             setattr(sys.modules[package], name, value)
             return value
-        if name in renamed:
-            place = renamed[name].replace(":", ".")
-            text = f"{package}.{name} is {place} now; the old name goes with the next version"
-            warnings.warn(text, DeprecationWarning, stacklevel=2)
-            return _found(renamed[name])
         raise AttributeError(f"module {package!r} has no attribute {name!r}")
 
     return getattribute
