@@ -1,9 +1,8 @@
 """``python -m jast``: `jast.stress` of a built-in system, or of one in a file of the user;
-or one search of a built-in system, beside a Monte Carlo baseline of as many simulations.
+or one search of a built-in system.
 """
 
 import argparse
-import contextlib
 import importlib.util
 import sys
 from pathlib import Path
@@ -11,9 +10,8 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from jast import nominal, plot, replay, save, simulators
+from jast import plot, replay, save, simulators
 from jast._src.core import actions, failures, rewards
-from jast._src.core.actions import UniformBox
 from jast._src.core.check import check
 from jast._src.core.rewards import likelihood
 from jast._src.core.signature import outline
@@ -26,7 +24,6 @@ from jast._src.search.monte_carlo import monte_carlo
 from jast._src.search.result import table
 from jast._src.simulators.svg_states import DRAWN
 from jast._src.stress_testing.stress import DEFAULT_BUDGET
-from jast._src.util.intervals import clopper_pearson
 from jast.explain import cards
 from jast.stress_testing import stress
 
@@ -86,7 +83,7 @@ def main(argv=None):
         if not options.no_cache:
             _keep_programs()
         own = _load(parser, options.system) if options.system else None
-        return _stress(options, own) if options.method == "stress" else _run(options)
+        return _stress(options, own) if options.method == "stress" else _search(options)
     except ValueError as e:
         # a count that the search refuses
         if not str(e).startswith(f"{options.method.replace('-', '_')}: "):
@@ -120,7 +117,7 @@ def _parser():
     add(
         "--method",
         choices=["stress", "forest", "mcts", "cem", "monte-carlo"],
-        help="jast.stress, or one search with its Monte Carlo baseline (default: stress; forest"
+        help="jast.stress, or one search (default: stress; forest"
         " where a count of a search is given)",
     )
     for name, text in [
@@ -203,12 +200,12 @@ def _stress(options, own):
         print(f"{_episode(best)}\n")
     path = options.output / "report.npz"
     save(path, report)
-    archive = options.output / "failures.npz"
-    failures.save(archive, report.failures, report.settings | dict(simulator=name))
+    print(f"saved {path}")
+    _save_archive(options, report)
     page = options.output / "report.html"
     draw = simulators.draw if isinstance(outline(sim).state, tuple(DRAWN)) else None
     report.html(page, draw=draw, explanations=_explained(options, sim, report))
-    print(f"saved {path}\nsaved {archive}\nsaved {page}")
+    print(f"saved {page}")
     if best is not None:
         _save_pictures(options, {"episode": lambda: _draw_episode(options, own, best, sim)})
     return 130 if "interrupted" in report.settings else 0
@@ -225,84 +222,42 @@ def _explained(options, sim, report):
     return found
 
 
-def _run(options):
+def _search(options):
+    """One search of a built-in system: its numbers, its best episode, an archive, pictures."""
     make, reward, chosen = SYSTEMS[options.simulator]
-    sim = check(make(), chosen)
-    keys = jax.random.split(jax.random.key(options.seed), 3)
-    print(
-        f"{options.simulator}, seed {options.seed}: as it is, without a search, its disturbances"
-        f" drawn from its own model\n{nominal(keys[0], sim, episodes=100_000)}\n",
-        flush=True,
-    )
-
-    common = dict(reward=reward, actions=chosen, progress=not options.quiet)
-    found = _search(keys[1], sim, options, common)
-    results = {options.method: found}
-    stopped = "interrupted" in found.settings
-    if options.method != "monte-carlo" and not stopped:
-        with contextlib.suppress(KeyboardInterrupt):
-            results["monte-carlo"] = monte_carlo(keys[2], sim, episodes=found.episodes, **common)
-        stopped = "monte-carlo" not in results or "interrupted" in results["monte-carlo"].settings
-    print(f"{table(results)}\n{_shares(results)}{_box_note(chosen)}\n")
-    print(f"{_episode(found.best)}\n\n{found.failures}\n")
-
-    archive = options.output / "failures.npz"
-    failures.save(archive, found.failures, found.settings | dict(simulator=options.simulator))
-    print(f"saved {archive}")
-    draw = {
-        "episode": lambda: _draw_episode(options, None, found.best, sim),
-        "history": lambda: plot.history(results, total=True),
-    }
-    _save_pictures(options, draw)
-    if stopped:
-        print("interrupted: these are the results of what was done")
-    return 130 if stopped else 0
-
-
-def _search(key, sim, options, common):
+    sim, key = check(make(), chosen), jax.random.key(options.seed)
     trees = options.trees or 200
     each = options.simulations or (500 if options.method == "forest" else 9000)
+    common = dict(reward=reward, actions=chosen, progress=not options.quiet)
+    of_trees = dict(trees=trees, simulations=each, mode="paper" if options.paper else "default")
     if options.method == "monte-carlo":
-        return monte_carlo(key, sim, episodes=trees * each, **common)
-    if options.method == "cem":
+        found = monte_carlo(key, sim, episodes=trees * each, **common)
+    elif options.method == "cem":
         samples = -(-each // ITERATIONS)
         counts = dict(samples=samples, elites=-(-samples // 10), iterations=ITERATIONS)
-        return cem(key, sim, trees=trees, **counts, **common)
-    of_trees = dict(trees=trees, simulations=each, mode="paper" if options.paper else "default")
-    if options.method == "mcts":
-        return mcts(key, sim, **of_trees, **common)
-    prunes = options.prunes or 18
-    return forest(key, sim, prunes=prunes, heads=options.heads, **of_trees, **common)
+        found = cem(key, sim, trees=trees, **counts, **common)
+    elif options.method == "mcts":
+        found = mcts(key, sim, **of_trees, **common)
+    else:
+        prunes = options.prunes or 18
+        found = forest(key, sim, prunes=prunes, heads=options.heads, **of_trees, **common)
+    print(f"{options.simulator}, seed {options.seed}\n{table({options.method: found})}\n")
+    print(f"{_episode(found.best)}\n\n{found.failures}\n")
+    _save_archive(options, found)
+    draw = {
+        "episode": lambda: _draw_episode(options, None, found.best, sim),
+        "history": lambda: plot.history(found),
+    }
+    _save_pictures(options, draw)
+    return 130 if "interrupted" in found.settings else 0
 
 
-def _shares(results):
-    """What is counted of independent trials, with its interval: trees, and the episodes of Monte
-    Carlo. Those of a tree depend on each other.
-    """
-    lines = []
-    for name, r in results.items():
-        if name == "monte-carlo":
-            what, k, n = "episodes", r.failures.seen, r.episodes
-        else:
-            what, k, n = "trees", int(r.failing_per_tree.sum()), len(r.failing_per_tree)
-        low, high = clopper_pearson(k, n)
-        interval = (
-            "no interval: they share heads"
-            if r.heads is not None
-            else f"95 % [{100 * low:.4g}, {100 * high:.4g}]"
-        )
-        lines.append(f"{name:14} failing {what} {k} of {n}: {100 * k / n:.4g} %, {interval}")
-    return "\n".join(lines)
-
-
-def _box_note(chosen):
-    """What the shares of failures are of, where they are not of the system's own disturbances."""
-    if not isinstance(chosen, UniformBox):
-        return ""
-    return (
-        "\nthese draw disturbances uniformly from the box that the search chooses from: what a"
-        " search is compared with. How often the system fails by itself is the rate at the top"
-    )
+def _save_archive(options, found):
+    """The failures of a search or a report."""
+    path = options.output / "failures.npz"
+    name = options.system or options.simulator
+    failures.save(path, found.failures, found.settings | dict(simulator=name))
+    print(f"saved {path}")
 
 
 def _episode(episode):

@@ -53,18 +53,9 @@ def test_every_method_reports_and_saves(capsys, tmp_path, method):
         capsys, tmp_path, "--method", method, *(["--prunes", "3"] if method == "forest" else [])
     )
     assert status == 0
-    assert "undisturbed    no failure" in text
-    assert "95 %" in text
     assert "best episode" in text
-    rows = [
-        line.split()[:2]
-        for line in text.splitlines()
-        if line.startswith((method, "monte-carlo")) and "failing" not in line
-    ]
-    episodes = str(2 * 3 * 30 if method == "forest" else 2 * 30)
-    assert rows == [[method, episodes]] + (
-        [["monte-carlo", episodes]] if method != "monte-carlo" else []
-    )
+    [row] = [line for line in text.splitlines() if line.startswith(method)]
+    assert int(row.split()[1]) == (2 * 3 * 30 if method == "forest" else 2 * 30)
     held, settings = jast.failures.load(out / "failures.npz", jast.simulators.ferry())
     assert held.size == 0
     assert settings["simulator"] == "ferry"
@@ -135,9 +126,6 @@ def test_every_simulator(capsys, tmp_path, simulator):
     assert status == 0 and text.startswith(f"{simulator}, seed 0")
     assert ("\n  x0: " in text) == (simulator == "landing")
     make, reward, chosen = cli.SYSTEMS[simulator]
-    assert "its disturbances drawn from its own model\nundisturbed" in text
-    box = isinstance(chosen, jast.actions.UniformBox)  # its rate is not the one at the top
-    assert ("the rate at the top" in text) == box
     jast.check(make(), chosen)
     held, settings = jast.failures.load(out / "failures.npz", make())
     assert settings["mode"] == "paper" and settings["widening"] == [0.5, 0.6]
@@ -149,7 +137,7 @@ def test_every_simulator(capsys, tmp_path, simulator):
 @pytest.mark.long
 def test_heads_of_a_forest(capsys, tmp_path):
     status, text, out = run(capsys, tmp_path, "--prunes", "2", "--heads", "both")
-    assert status == 0 and "no interval: they share heads" in text
+    assert status == 0 and "best episode" in text
     settings = jast.failures.load(out / "failures.npz", jast.simulators.ferry())[1]
     assert settings["heads"] == "both" and settings["head_settings"]["round"] == 1
 
@@ -231,18 +219,6 @@ def test_interrupted_at_once(capsys, tmp_path, monkeypatch):
     assert "interrupted before there was a result" in capsys.readouterr().err
 
 
-def test_interrupted_baseline_still_reports(capsys, tmp_path, monkeypatch):
-    def stop(*args, **kwargs):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(cli, "monte_carlo", stop)
-    status, text, out = run(capsys, tmp_path, "--simulator", "walk1d", "--prunes", "2")
-    assert status == 130
-    assert "interrupted: " in text
-    assert (out / "failures.npz").exists()
-    assert "monte-carlo" not in text
-
-
 def test_interrupted_search_reports_what_was_done(capsys, tmp_path, monkeypatch):
     whole = cli.forest
 
@@ -268,8 +244,6 @@ def test_interrupted_search_reports_what_was_done(capsys, tmp_path, monkeypatch)
     )
     text = capsys.readouterr().out
     assert status == 130
-    assert "interrupted: " in text
-    assert "monte-carlo" not in text
     assert (
         0
         < int(next(line for line in text.splitlines() if line.startswith("forest")).split()[1])
