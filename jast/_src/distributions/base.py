@@ -14,7 +14,15 @@ import numpy as np
 if TYPE_CHECKING:
     import chex
 
-__all__ = ["Distribution", "Elementwise", "float_array", "is_distribution", "tree_map"]
+__all__ = [
+    "Distribution",
+    "Elementwise",
+    "Wrapped",
+    "broadcast",
+    "float_array",
+    "is_distribution",
+    "tree_map",
+]
 
 
 class _Kind(type):
@@ -200,5 +208,22 @@ class Elementwise(Distribution):
     def batch_shape(self) -> tuple[int, ...]:
         return jax.lax.broadcast_shapes(*(getattr(self, name).shape for name in self._parameters))
 
-    def _broadcast(self, parameter: jax.Array) -> jax.Array:
-        return jnp.broadcast_to(parameter, self.batch_shape)
+
+def broadcast(name: str) -> Any:
+    """A property of an `Elementwise`: the parameter ``name``, broadcast with the others."""
+    return property(lambda d: jnp.broadcast_to(getattr(d, name), d.batch_shape))
+
+
+class Wrapped(Distribution):
+    """Of another ``distribution``, whose values have the same shapes."""
+
+    def __init__(self, distribution: Any) -> None:
+        self._distribution = distribution
+
+    @property
+    def event_shape(self) -> Any:
+        return self._distribution.event_shape
+
+    @property
+    def batch_shape(self) -> tuple[int, ...]:
+        return self._distribution.batch_shape

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from jax.lax import lgamma
 
-from jast._src.distributions.base import Elementwise, float_array
+from jast._src.distributions.base import Elementwise, broadcast, float_array
 from jast._src.distributions.normal import Symmetric
 
 if TYPE_CHECKING:
@@ -84,17 +84,11 @@ class Uniform(Elementwise):
     """
 
     _parameters = "_low", "_high"
+    low: jax.Array = broadcast("_low")
+    high: jax.Array = broadcast("_high")
 
     def __init__(self, low: chex.ArrayTree = 0.0, high: chex.ArrayTree = 1.0) -> None:
         self._low, self._high = float_array(low), float_array(high)
-
-    @property
-    def low(self) -> jax.Array:
-        return self._broadcast(self._low)
-
-    @property
-    def high(self) -> jax.Array:
-        return self._broadcast(self._high)
 
     @property
     def range(self) -> jax.Array:
@@ -140,10 +134,6 @@ class _Pair(Elementwise):
     def dtype(self) -> Any:
         return jnp.result_type(self._a, self._b)
 
-    @property
-    def _both(self) -> tuple[jax.Array, ...]:
-        return self._broadcast(self._a), self._broadcast(self._b)
-
 
 class Gamma(_Pair):
     """Density proportional to x^(concentration - 1) exp(-rate x), x > 0.
@@ -158,17 +148,12 @@ class Gamma(_Pair):
     def __init__(self, concentration: chex.Numeric, rate: chex.Numeric) -> None:
         super().__init__(concentration, rate)
 
-    @property
-    def concentration(self) -> jax.Array:
-        return self._both[0]
-
-    @property
-    def rate(self) -> jax.Array:
-        return self._both[1]
+    concentration: jax.Array = broadcast("_a")
+    rate: jax.Array = broadcast("_b")
 
     def _sample_n(self, key: chex.PRNGKey, n: int) -> Any:
-        a, rate = self._both
-        return jax.random.gamma(key, a, (n, *a.shape), self.dtype) / rate[None]
+        a = self.concentration
+        return jax.random.gamma(key, a, (n, *a.shape), self.dtype) / self.rate[None]
 
     def log_prob(self, value: Any) -> chex.Array:
         a, rate = self._a, self._b
@@ -202,17 +187,12 @@ class Beta(_Pair):
         super().__init__(alpha, beta)
         self._norm = lgamma(self._a) + lgamma(self._b) - lgamma(self._a + self._b)
 
-    @property
-    def alpha(self) -> jax.Array:
-        return self._both[0]
-
-    @property
-    def beta(self) -> jax.Array:
-        return self._both[1]
+    alpha: jax.Array = broadcast("_a")
+    beta: jax.Array = broadcast("_b")
 
     def _sample_n(self, key: chex.PRNGKey, n: int) -> Any:
-        a, b = self._both
-        return jax.random.beta(key, a, b, (n, *a.shape), self.dtype)
+        shape = (n, *self.batch_shape)
+        return jax.random.beta(key, self.alpha, self.beta, shape, self.dtype)
 
     def log_prob(self, value: Any) -> chex.Array:
         a, b = self._a, self._b

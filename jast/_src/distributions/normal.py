@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import jax
 import jax.numpy as jnp
 
-from jast._src.distributions.base import Distribution, Elementwise, float_array
+from jast._src.distributions.base import Distribution, Elementwise, broadcast, float_array
 from jast._src.distributions.normal_tails import HALF_LOG_2PI, ndtr
 
 if TYPE_CHECKING:
@@ -28,18 +28,12 @@ class LocationScale(Elementwise):
     """x = loc + scale e, e of a standard distribution; ``loc`` and ``scale`` broadcast."""
 
     _parameters = "_loc", "_scale"
+    loc: jax.Array = broadcast("_loc")
+    scale: jax.Array = broadcast("_scale")
 
     def __init__(self, loc: chex.Numeric, scale: chex.Numeric) -> None:
         self._loc: jax.Array = float_array(loc)
         self._scale: jax.Array = float_array(scale)
-
-    @property
-    def loc(self) -> jax.Array:
-        return self._broadcast(self._loc)
-
-    @property
-    def scale(self) -> jax.Array:
-        return self._broadcast(self._scale)
 
     @property
     def dtype(self) -> Any:

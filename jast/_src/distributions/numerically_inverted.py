@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jax.lax import lgamma, stop_gradient
 from jax.scipy.special import betainc, erfinv
 
-from jast._src.distributions.base import Distribution, float_array
+from jast._src.distributions.base import Distribution, broadcast, float_array
 from jast._src.distributions.family_table import register
 from jast._src.distributions.log_tail_rows import log_tails_of
 from jast._src.distributions.normal import Symmetric
@@ -88,6 +88,7 @@ class StudentT(Symmetric):
     """
 
     _parameters = "_df", "_loc", "_scale"
+    df: jax.Array = broadcast("_df")
 
     def __init__(
         self, df: chex.Numeric, loc: chex.Numeric = 0.0, scale: chex.Numeric = 1.0
@@ -98,10 +99,6 @@ class StudentT(Symmetric):
     @property
     def dtype(self) -> Any:
         return jnp.result_type(self._df, self._loc, self._scale)
-
-    @property
-    def df(self) -> jax.Array:
-        return self._broadcast(self._df)
 
     def _sample_n(self, key: chex.PRNGKey, n: int) -> Any:
         shape = (n, *self.batch_shape)

@@ -19,7 +19,7 @@ from jast._src.distributions import (
     numerically_inverted,
     skewed,
 )
-from jast._src.distributions.base import Distribution
+from jast._src.distributions.base import Wrapped
 from jast._src.distributions.operations import no_quantile
 from jast._src.runtime._jax import is_traced
 
@@ -49,19 +49,8 @@ def translate(d: Any, independent: Callable[[Any, int], Any]) -> Any:
     return OF_NUMPYRO.get(theirs[0], NumPyro)(d)
 
 
-class NumPyro(Distribution):
+class NumPyro(Wrapped):
     """A distribution of NumPyro that jast has no family for."""
-
-    def __init__(self, distribution: Any) -> None:
-        self._distribution = distribution
-
-    @property
-    def event_shape(self) -> Any:
-        return self._distribution.event_shape
-
-    @property
-    def batch_shape(self) -> tuple[int, ...]:
-        return self._distribution.batch_shape
 
     @property
     def name(self) -> str:

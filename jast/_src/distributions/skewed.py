@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import jax
 import jax.numpy as jnp
 
-from jast._src.distributions.base import Elementwise, float_array
+from jast._src.distributions.base import Elementwise, broadcast, float_array
 from jast._src.distributions.family_table import register
 from jast._src.distributions.log_tail_rows import of_log_tails
 from jast._src.distributions.normal import LocationScale
@@ -150,17 +150,11 @@ class Weibull(Elementwise):
     """
 
     _parameters = "_shape", "_scale"
+    concentration: jax.Array = broadcast("_shape")
+    scale: jax.Array = broadcast("_scale")
 
     def __init__(self, concentration: chex.Numeric, scale: chex.Numeric) -> None:
         self._shape, self._scale = float_array(concentration), float_array(scale)
-
-    @property
-    def concentration(self) -> jax.Array:
-        return self._broadcast(self._shape)
-
-    @property
-    def scale(self) -> jax.Array:
-        return self._broadcast(self._scale)
 
     def _sample_n(self, key: chex.PRNGKey, n: int) -> Any:
         k, scale = self.concentration, self.scale
@@ -202,20 +196,14 @@ class TruncatedNormal(LocationScale):
     """
 
     _parameters = "_loc", "_scale", "_low", "_high"
+    low: jax.Array = broadcast("_low")
+    high: jax.Array = broadcast("_high")
 
     def __init__(
         self, loc: chex.Numeric, scale: chex.Numeric, low: chex.ArrayTree, high: chex.ArrayTree
     ) -> None:
         super().__init__(loc, scale)
         self._low, self._high = float_array(low), float_array(high)
-
-    @property
-    def low(self) -> jax.Array:
-        return self._broadcast(self._low)
-
-    @property
-    def high(self) -> jax.Array:
-        return self._broadcast(self._high)
 
     def ends(self) -> tuple[jax.Array, jax.Array, jax.Array]:
         """(low, high) in standard deviations from loc, and the log of the mass between them."""

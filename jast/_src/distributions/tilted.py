@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import jax
 import jax.numpy as jnp
 
-from jast._src.distributions.base import Distribution
+from jast._src.distributions.base import Wrapped
 from jast._src.distributions.family_table import row
 from jast._src.distributions.normal_tails import float_dtype
 from jast._src.distributions.operations import event_like, from_normal, has_cdf, to_normal
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 __all__ = ["Tilted", "tilted", "untiltable"]
 
 
-class Tilted(Distribution):
+class Tilted(Wrapped):
     """What `tilted` makes of a distribution of floats that has a quantile function and its inverse,
     taken number by number.
 
@@ -36,15 +36,8 @@ class Tilted(Distribution):
     """
 
     def __init__(self, distribution: Any, mean: jax.Array, deviation: jax.Array) -> None:
-        self._distribution, self._mean, self._deviation = distribution, mean, deviation
-
-    @property
-    def event_shape(self) -> Any:
-        return self._distribution.event_shape
-
-    @property
-    def batch_shape(self) -> tuple[int, ...]:
-        return self._distribution.batch_shape
+        super().__init__(distribution)
+        self._mean, self._deviation = mean, deviation
 
     def _sample_n(self, key: chex.PRNGKey, n: int) -> Any:
         z = self._mean[None] + self._deviation[None] * jax.random.normal(

@@ -20,15 +20,19 @@ if TYPE_CHECKING:
 __all__ = ["differential", "regression"]
 
 
+class Side(NamedTuple):
+    """One of two systems."""
+
+    state: Any
+    failed: chex.Array
+    over: chex.Array
+
+
 class Both(NamedTuple):
     """The state of two systems under the same disturbances."""
 
-    a: Any
-    b: Any
-    failed_a: chex.Array
-    failed_b: chex.Array
-    over_a: chex.Array
-    over_b: chex.Array
+    a: Side
+    b: Side
     nearest: chex.Array
     """Miss distance of b so far"""
     t: chex.Array
@@ -121,61 +125,49 @@ def _shapes(like):
 
 
 def _arrived(sim, state, t):
-    """(failed, over, miss distance) of one system at ``state`` after ``t`` steps."""
+    """One system at ``state`` after ``t`` steps: (`Side`, miss distance)."""
     event, distance, *_ = sim.evaluate(state)
     over = sim.is_terminal(state) | (t >= sim.horizon)
     if sim.episodic:
         event, distance = event & over, jnp.where(over, distance, jnp.inf)
-    return event, event | over, distance
+    return Side(state, event, event | over), distance
 
 
 def _init(sim_a, sim_b, x0):
     t = jnp.zeros((), jnp.int32)
-    a, b = with_strong_types(sim_a.init(x0)), with_strong_types(sim_b.init(x0))
-    failed_a, over_a, _ = _arrived(sim_a, a, t)
-    failed_b, over_b, distance = _arrived(sim_b, b, t)
-    return Both(
-        a=a,
-        b=b,
-        failed_a=failed_a,
-        failed_b=failed_b,
-        over_a=over_a,
-        over_b=over_b,
-        nearest=with_strong_types(distance),
-        t=t,
-    )
+    sides = (_arrived(sim, with_strong_types(sim.init(x0)), t) for sim in (sim_a, sim_b))
+    (a, _), (b, distance) = sides
+    return Both(a, b, with_strong_types(distance), t)
+
+
+def _moved(sim, side, x, t):
+    """``side`` a step later: (`Side`, miss distance). One that is over stays where it is."""
+    state = select(side.over, side.state, with_strong_types(sim.step(side.state, x)))
+    after, distance = _arrived(sim, state, t)
+    return select(side.over, side, after), distance
 
 
 def _step(sim_a, sim_b, state, x):
     t = state.t + 1
-    # one that is over stays where it is
-    a = select(state.over_a, state.a, with_strong_types(sim_a.step(state.a, x)))
-    b = select(state.over_b, state.b, with_strong_types(sim_b.step(state.b, x)))
-    failed_a, over_a, _ = _arrived(sim_a, a, t)
-    failed_b, over_b, distance = _arrived(sim_b, b, t)
-    return Both(
-        a=a,
-        b=b,
-        failed_a=jnp.where(state.over_a, state.failed_a, failed_a),
-        failed_b=jnp.where(state.over_b, state.failed_b, failed_b),
-        over_a=state.over_a | over_a,
-        over_b=state.over_b | over_b,
-        nearest=jnp.where(state.over_b, state.nearest, jnp.minimum(state.nearest, distance)),
-        t=t,
-    )
+    a, _ = _moved(sim_a, state.a, x, t)
+    b, distance = _moved(sim_b, state.b, x, t)
+    nearest = jnp.where(state.b.over, state.nearest, jnp.minimum(state.nearest, distance))
+    return Both(a, b, nearest, t)
 
 
 def _disturbance(sim_a, sim_b, state):
-    return D.where(state.over_b, sim_a.disturbance(state.a), sim_b.disturbance(state.b))
+    of_a, of_b = sim_a.disturbance(state.a.state), sim_b.disturbance(state.b.state)
+    return D.where(state.b.over, of_a, of_b)
 
 
 def _is_terminal(state):
-    return state.failed_a | (state.over_b & ~state.failed_b) | (state.over_a & state.over_b)
+    a, b = state.a, state.b
+    return a.failed | (b.over & ~b.failed) | (a.over & b.over)
 
 
 def _evaluate(sim_b, state):
-    event = state.failed_b & state.over_a & ~state.failed_a
-    both = state.failed_b & ~event
+    event = state.b.failed & state.a.over & ~state.a.failed
+    both = state.b.failed & ~event
     quiet = jnp.maximum(_quiet(sim_b).astype(state.nearest.dtype), 1e-3)
     return event, jnp.where(both, quiet, state.nearest)
 
@@ -186,4 +178,4 @@ def _quiet(sim):
 
 
 def _observe(sim_a, sim_b, state):
-    return jnp.concatenate([sim_a.observe(state.a), sim_b.observe(state.b)])
+    return jnp.concatenate([sim_a.observe(state.a.state), sim_b.observe(state.b.state)])

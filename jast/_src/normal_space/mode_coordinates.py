@@ -16,7 +16,7 @@ from jax.tree_util import Partial
 from jast import distributions as D
 from jast._src.core.signature import outline
 from jast._src.core.simulator import Simulator
-from jast.distributions import Distribution
+from jast._src.distributions.base import Wrapped
 
 __all__ = ["Centred", "centred"]
 
@@ -24,19 +24,8 @@ MOST = 5.0
 """How far from 0 a mode may be; one at the end of its support is infinitely far."""
 
 
-class Centred(Distribution):
+class Centred(Wrapped):
     """The same distribution, with its mode at the normal number 0."""
-
-    def __init__(self, distribution: Any):
-        self._distribution = distribution
-
-    @property
-    def event_shape(self) -> Any:
-        return self._distribution.event_shape
-
-    @property
-    def batch_shape(self) -> tuple[int, ...]:
-        return self._distribution.batch_shape
 
     def _sample_n(self, key: jax.Array, n: int) -> Any:
         return jax.vmap(lambda k: D.sample(self._distribution, k))(jax.random.split(key, n))

@@ -20,8 +20,9 @@ from jax import lax
 
 from jast import distributions as D
 from jast._src.core import actions as choices
+from jast._src.core import rewards
 from jast._src.core.check import contract
-from jast._src.core.episode import Episode, replay, rollout
+from jast._src.core.episode import Episode, play_back, rollout
 from jast._src.core.policy import Policy
 from jast._src.core.rewards import likelihood
 from jast._src.core.signature import outline
@@ -302,17 +303,7 @@ def latents(sim, recorded, of_start):
     """
 
     def one(x0, x, length):
-        zero = jnp.zeros(())
-        given = Episode(
-            x0=x0,
-            disturbances=x,
-            log_prob=zero,
-            distance=zero,
-            failure=zero.astype(bool),
-            length=length,
-            reward=zero,
-        )
-        e = replay(sim, given)
+        e = play_back(sim, rewards.STANDARD, x0, x, length)
         states = jax.tree.map(lambda a: a[:-1], e.states)
         z = jax.vmap(lambda s, x: D.to_normal(sim.disturbance(s), x))(states, e.disturbances)
         live = jnp.arange(sim.horizon, dtype=jnp.int32) < e.length
