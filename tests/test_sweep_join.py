@@ -13,6 +13,7 @@ from systems import line
 import jast
 from jast._src.estimate.population.failure_sample import Sample, draws_of_sample
 from jast._src.sweeping.curve import join_rows
+from jast._src.sweeping.simulators import make_simulators
 from jast.estimate import Estimate
 
 LIMITS = np.linspace(3.0, 3.7, 8)
@@ -29,7 +30,7 @@ def log_truth(limits, horizon=1):
     return np.log([2 * PHI.cdf(-v / math.sqrt(horizon)) for v in limits])
 
 
-MADE = jast._src.sweeping.simulators.make_simulators(walk, [{"limit": v} for v in LIMITS])
+MADE = make_simulators(walk, [{"limit": v} for v in LIMITS])
 BLANK = dict.fromkeys(Estimate._fields)
 
 
