@@ -15,6 +15,7 @@ from jast._src.estimate.population.failure_sample import Sample, draws_of_sample
 from jast._src.sweeping.curve import join_rows
 from jast._src.sweeping.simulators import make_simulators
 from jast.estimate import Estimate
+from jast.sweeping import Sweep
 
 LIMITS = np.linspace(3.0, 3.7, 8)
 PHI = NormalDist()
@@ -124,7 +125,7 @@ def test_a_row_that_misses_a_failure_mode_is_named():
     assert j.apart == (1, 2)
     assert join_rows(keys(5), MADE[:5], [row(rng, i, 2000) for i in range(5)]).apart == ()
     none, said = (None,) * 5, dict(judged=1, apart=[1, 2])
-    table = jast.sweeping.Sweep({"limit": tuple(LIMITS[:5])}, (1,) * 5, none, none, said, *j[:2])
+    table = Sweep({"limit": tuple(LIMITS[:5])}, (1,) * 5, none, none, said, *j[:2])
     assert str(table).splitlines()[-2:] == [
         "rows 1 and 2: their failures say another ratio",
         "rows 2 and 3: their failures say another ratio",
