@@ -27,7 +27,7 @@ from benchmarks.literature import CASES as LITERATURE
 from benchmarks.sizes import add_choices, options, print_report, printer, size, timed
 from jast._src.estimate.host_populations import equilibrate
 from jast._src.normal_space import transform
-from jast._src.normal_space.evaluate_points import judged
+from jast._src.normal_space.evaluate_points import evaluate_points
 from jast.estimate import failure_probability, failure_samples
 
 __all__ = ["density_and_coverage", "run"]
@@ -76,7 +76,7 @@ def by_rejection(sim: jast.Simulator) -> Callable:
             z = rng.standard_normal(
                 (LANES, transform.dimension(sim)), transform.normal_numbers(sim)
             )
-            kept = np.concatenate([kept, z[judged(sim, z).failure]])
+            kept = np.concatenate([kept, z[evaluate_points(sim, z).failure]])
         return kept[:n]
 
     return draw

@@ -24,7 +24,7 @@ import jast
 from benchmarks.closed_loops import system
 from benchmarks.sizes import options, print_report, printer, size, timed
 from benchmarks.stress_systems import lane
-from jast._src.normal_space.evaluate_points import judged
+from jast._src.normal_space.evaluate_points import evaluate_points
 from jast._src.normal_space.transform import dimension
 from jast.distributions import Normal
 from jast.estimate import failure_probability
@@ -167,11 +167,11 @@ def run_joined(name, n, keys, budget):
 def _plain_shares(sims, seed, seconds):
     """The share of plain draws that fail, the same for all systems, within so many CPU seconds."""
     rng, failing, n, d = np.random.default_rng(seed), np.zeros(len(sims)), 0, dimension(sims[0])
-    [judged(s, np.zeros((1, d), np.float32)) for s in sims[:1]]  # compiled
+    [evaluate_points(s, np.zeros((1, d), np.float32)) for s in sims[:1]]  # compiled
     begun = time.process_time()
     while not n or time.process_time() - begun < seconds:
         z = rng.standard_normal((8192, d), np.float32)
-        failing += [judged(s, z).failure.sum() for s in sims]
+        failing += [evaluate_points(s, z).failure.sum() for s in sims]
         n += len(z)
     return np.maximum(failing, 0.5) / n  # none at all counts as half a failure
 

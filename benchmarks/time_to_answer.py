@@ -23,7 +23,7 @@ from jax.tree_util import Partial
 import jast
 from benchmarks.closed_loops import JUDGED, RARE, TUNED, system
 from benchmarks.sizes import add_choices, options, percent, print_report, printer, size
-from jast._src.normal_space.evaluate_points import judged
+from jast._src.normal_space.evaluate_points import evaluate_points
 from jast._src.normal_space.transform import dimension
 from jast.simulators import limit_state
 
@@ -172,7 +172,7 @@ def _subset(about, seed):
             super().__init__(d, 1)
 
         def _exec_sample(self, x):
-            o = judged(sim, np.asarray(x, np.float32))
+            o = evaluate_points(sim, np.asarray(x, np.float32))
             return np.where(o.failure, -1.0, np.maximum(o.distance, 1e-30)).reshape(-1, 1)
 
     vector = ot.RandomVector(ot.Normal(d))

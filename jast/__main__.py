@@ -14,7 +14,7 @@ from jast import plot, replay, save, simulators
 from jast._src.core import actions, failures, rewards
 from jast._src.core.check import check
 from jast._src.core.rewards import likelihood
-from jast._src.core.signature import outline
+from jast._src.core.signature import signature_of
 from jast._src.core.simulator import Simulator
 from jast._src.runtime.compilation_cache import cache
 from jast._src.search.cem import cem
@@ -203,7 +203,7 @@ def _stress(options, own):
     print(f"saved {path}")
     _save_archive(options, report)
     page = options.output / "report.html"
-    draw = simulators.draw if isinstance(outline(sim).state, tuple(DRAWN)) else None
+    draw = simulators.draw if isinstance(signature_of(sim).state, tuple(DRAWN)) else None
     report.html(page, draw=draw, explanations=_explained(options, sim, report))
     print(f"saved {page}")
     if best is not None:
@@ -213,8 +213,8 @@ def _stress(options, own):
 
 def _explained(options, sim, report):
     """What the page says of the modes: a tenth of what the search for them took, on top."""
-    about = outline(sim)
-    if not (report.modes and about.disturbance.quantile and about.start.quantile):
+    signature = signature_of(sim)
+    if not (report.modes and signature.disturbance.quantile and signature.start.quantile):
         return ()
     budget = min(report.settings["budget"], DEFAULT_BUDGET) // 10
     found = cards(jax.random.key(options.seed), sim, report, budget)

@@ -424,10 +424,10 @@ def test_nominal_interrupted_is_the_nominal_of_what_was_done(key, equal, monkeyp
     real = nominal._unit
 
     def interrupted(stop_at):
-        def unit(job, number, post):
+        def unit(job, number, context):
             if number == stop_at:
                 raise KeyboardInterrupt
-            return real(job, number, post)
+            return real(job, number, context)
 
         monkeypatch.setattr(nominal, "_unit", unit)
         return jast.nominal(key, walk1d(), episodes=2100)

@@ -8,7 +8,7 @@ from scipy import stats
 from systems import line
 
 from jast import distributions as D
-from jast._src.core.signature import outline
+from jast._src.core.signature import signature_of
 from jast._src.estimate.proposal_search.mixture_draws import plain_chunk
 from jast.estimate import events, monte_carlo
 
@@ -38,7 +38,7 @@ def test_the_probability(family):
     """Of a failure above 2: the count is binomial, and |z| < 4.5 but once in 150,000."""
     make, exact, closed = CASES[family]
     sim, p = above(make(), 2.0), exact.sf(2.0)
-    assert outline(sim).closed == closed
+    assert signature_of(sim).closed == closed
     found = monte_carlo(jax.random.key(3), sim, SAMPLES)
     assert found.samples == found.evaluations == SAMPLES
     assert abs(found.failing - p * SAMPLES) < 4.5 * np.sqrt(p * (1 - p) * SAMPLES)

@@ -12,7 +12,7 @@ from systems import ring, walk
 import jast
 from jast import actions
 from jast import distributions as D
-from jast._src.core.signature import outline
+from jast._src.core.signature import signature_of
 from jast._src.distributions.normal_tails import normal_score
 from jast._src.normal_space.sequences import (
     Steps,
@@ -127,8 +127,8 @@ def test_player_at_standard_noise_is_the_model(key, make):
     structures and a random start included.
     """
     sim, n = make(), 4000
-    about = outline(sim)
-    like0, like = about.x0, about.x
+    signature = signature_of(sim)
+    like0, like = signature.x0, signature.x
 
     @jax.jit
     def shares(key):

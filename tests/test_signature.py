@@ -12,7 +12,7 @@ from systems import ring, walk
 
 import jast
 from jast import distributions as D
-from jast._src.core.signature import Offer, ask, outline
+from jast._src.core.signature import Offer, ask, signature_of
 from jast._src.core.transition import begin
 from jast._src.util.pytrees import count_numbers
 
@@ -40,32 +40,36 @@ def watched(sim: jast.Simulator) -> tuple[jast.Simulator, Counter]:
 
 
 def test_of_a_walk():
-    about = outline(walk())
-    assert (about.x0, about.random_start) == ((), False)
-    assert (about.x.shape, about.x.dtype) == ((), default())
-    assert (about.state.shape, about.state.dtype) == ((), default())
-    assert about.dtype == default() and about.observation == (1,)
-    assert about.start == Offer("Fixed", True, "", frozenset({"Fixed"}))
-    assert about.disturbance.quantile
+    signature = signature_of(walk())
+    assert (signature.x0, signature.random_start) == ((), False)
+    assert (signature.x.shape, signature.x.dtype) == ((), default())
+    assert (signature.state.shape, signature.state.dtype) == ((), default())
+    assert signature.dtype == default() and signature.observation == (1,)
+    assert signature.start == Offer("Fixed", True, "", frozenset({"Fixed"}))
+    assert signature.disturbance.quantile
 
 
 def test_of_a_tree_of_disturbances_and_a_random_start():
     sim = ring()
-    about = outline(sim)
+    signature = signature_of(sim)
     episode = jast.rollout(jax.random.key(0), sim)
-    assert about.random_start
+    assert signature.random_start
     for like, value in (
-        (about.x0, episode.x0),
-        (about.x, jax.tree.map(lambda a: a[0], episode.disturbances)),
-        (about.state, jax.tree.map(lambda a: a[0], episode.states)),
+        (signature.x0, episode.x0),
+        (signature.x, jax.tree.map(lambda a: a[0], episode.disturbances)),
+        (signature.state, jax.tree.map(lambda a: a[0], episode.states)),
     ):
         assert jax.tree.map(lambda s: (s.shape, s.dtype), like) == jax.tree.map(
             lambda a: (a.shape, a.dtype), value
         )
-    assert about.dtype == episode.log_prob.dtype
-    assert (count_numbers(about.x0), count_numbers(about.x), about.observation) == (2, 3, (5,))
-    assert about.start == about.disturbance
-    assert about.start == Offer("Joint", True, "", frozenset({"Categorical", "Normal"}))
+    assert signature.dtype == episode.log_prob.dtype
+    assert (count_numbers(signature.x0), count_numbers(signature.x), signature.observation) == (
+        2,
+        3,
+        (5,),
+    )
+    assert signature.start == signature.disturbance
+    assert signature.start == Offer("Joint", True, "", frozenset({"Categorical", "Normal"}))
 
 
 def test_what_distributions_do_not_offer():
@@ -77,11 +81,11 @@ def test_what_distributions_do_not_offer():
         3,
         start=lambda: D.seeds((2,)),
     )
-    about = outline(seeds)
-    assert about.start == Offer("Seeds", False, "Seeds", frozenset({"Seeds"}))
-    assert about.disturbance == Offer("Joint", False, "Seeds", frozenset({"Normal", "Seeds"}))
-    assert not about.disturbance.quantile and not about.closed
-    assert (about.x0.shape, about.x0.dtype) == ((2,), jnp.uint32)
+    signature = signature_of(seeds)
+    assert signature.start == Offer("Seeds", False, "Seeds", frozenset({"Seeds"}))
+    assert signature.disturbance == Offer("Joint", False, "Seeds", frozenset({"Normal", "Seeds"}))
+    assert not signature.disturbance.quantile and not signature.closed
+    assert (signature.x0.shape, signature.x0.dtype) == ((2,), jnp.uint32)
 
 
 class Odd(D.Normal):
@@ -103,27 +107,29 @@ def test_what_raises_is_not_offered_and_not_missed(key):
         3,
         observe=lambda s: s.nothing,
     )
-    about = outline(sim)
+    signature = signature_of(sim)
     families = frozenset({f"{Odd.__module__}.Odd"})
-    assert about.disturbance == Offer("Odd", False, "Odd", families)
-    assert about.observation is None and not about.closed
+    assert signature.disturbance == Offer("Odd", False, "Odd", families)
+    assert signature.observation is None and not signature.closed
     assert jast.search.monte_carlo(key, sim, episodes=10).episodes == 10
     with pytest.raises(ValueError, match="observe: raised AttributeError"):
         jast.search.forest(key, sim, trees=2, prunes=1, simulations=2, heads="value")
     with pytest.raises(ZeroDivisionError):
-        outline(walk(init=lambda x0: 1 / 0))
+        signature_of(walk(init=lambda x0: 1 / 0))
 
 
 def test_of_a_black_box_without_a_run(monkeypatch):
     def system(disturbances):
         raise AssertionError("it was run")
 
-    about = outline(jast.blackbox.from_python(system, horizon=4, disturbance=D.Normal(0.0, 1.0)))
-    assert not about.random_start and about.x.shape == ()
-    assert about.disturbance == Offer("Normal", True, "", frozenset({"Normal"}))
-    assert about.disturbance.mode_is_median and about.closed
+    signature = signature_of(
+        jast.blackbox.from_python(system, horizon=4, disturbance=D.Normal(0.0, 1.0))
+    )
+    assert not signature.random_start and signature.x.shape == ()
+    assert signature.disturbance == Offer("Normal", True, "", frozenset({"Normal"}))
+    assert signature.disturbance.mode_is_median and signature.closed
     sim = jast.blackbox.from_python(blackboxes.walk, horizon=4)
-    assert outline(sim).disturbance == Offer("Seeds", False, "Seeds", frozenset({"Seeds"}))
+    assert signature_of(sim).disturbance == Offer("Seeds", False, "Seeds", frozenset({"Seeds"}))
 
 
 def _drift(drift, s, x):
@@ -159,13 +165,13 @@ def test_of_a_traced_simulator(transform):
 
     def look(scale):
         sim = jax.tree.unflatten(jax.tree.structure(one), [0.1, scale, jnp.full((), 3.0)])
-        found.append(outline(sim))
+        found.append(signature_of(sim))
         return scale * 2
 
     value = jnp.ones(()) if transform in (jax.jit, jax.grad) else jnp.ones(3)
     with jax.checking_leaks():
         transform(look)(value)
-    assert found == [outline(one)] and calls["init"] == 1
+    assert found == [signature_of(one)] and calls["init"] == 1
     leaves = jax.tree.leaves(found)
     assert leaves and not any(isinstance(leaf, jax.core.Tracer) for leaf in leaves)
 
@@ -173,7 +179,7 @@ def test_of_a_traced_simulator(transform):
 def test_another_value_is_no_other_outline_but_another_shape_is():
     calls = Counter()
     kind = jax.tree.structure(of(jnp.ones(()), jnp.ones(()), calls))
-    at = lambda *leaves: outline(jax.tree.unflatten(kind, [jnp.full((), 0.1), *leaves]))
+    at = lambda *leaves: signature_of(jax.tree.unflatten(kind, [jnp.full((), 0.1), *leaves]))
     one, two = (at(jnp.full((), v), jnp.ones(())) for v in (1.0, 2.0))
     assert one == two and calls["init"] == 1
     assert at(jnp.ones((2,)), jnp.ones(())).x.shape == (2,) and calls["init"] == 2
@@ -184,9 +190,9 @@ def test_precision():
     sim = walk(init=lambda x0: 0.0)
     for on, dtype in ((False, "float32"), (True, "float64"), (False, "float32")):
         with jax.enable_x64(on):
-            about = outline(sim)
-            assert (about.dtype, about.x.dtype, about.state.dtype) == (dtype,) * 3
-            assert not about.state.weak_type
+            signature = signature_of(sim)
+            assert (signature.dtype, signature.x.dtype, signature.state.dtype) == (dtype,) * 3
+            assert not signature.state.weak_type
             began = jax.eval_shape(lambda: begin(sim, jast._src.core.rewards.STANDARD, ()))
             assert {a.dtype for a in began[:4]} == {jnp.dtype(dtype)}
 

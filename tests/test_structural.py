@@ -8,7 +8,7 @@ import pytest
 
 from benchmarks.literature import CASES, collision_avoidance, table
 from benchmarks.structural import PROBLEMS
-from jast._src.normal_space.evaluate_points import judged
+from jast._src.normal_space.evaluate_points import evaluate_points
 
 DRAWS = 20_000
 
@@ -33,7 +33,7 @@ def test_a_simulator_fails_where_the_problem_does(name):
     """Its distributions are those of SciPy, its limit state that of NumPy, but for rounding."""
     problem = PROBLEMS[name]
     z = 2 * np.random.default_rng(1).standard_normal((2000, problem.dimension))
-    failure = judged(problem.simulator(), z.astype(np.float32)).failure
+    failure = evaluate_points(problem.simulator(), z.astype(np.float32)).failure
     g = problem.batch(z.astype(np.float32))
     sure = np.abs(g) > 1e-3 * np.abs(g).mean()
     assert np.array_equal(failure[sure], g[sure] < 0)

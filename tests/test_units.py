@@ -120,16 +120,16 @@ def same(equal):
     return check
 
 
-def square(shared, number, post):
+def square(shared, number, context):
     """A unit that needs no simulator."""
     return np.array(number**2)
 
 
-def fails(shared, number, post):
+def fails(shared, number, context):
     """Unit 1 never comes to its end."""
     if number == 1:
         raise ZeroDivisionError("one")
-    return square(shared, number, post)
+    return square(shared, number, context)
 
 
 class Flaky:
@@ -161,10 +161,10 @@ class Closing:
 
 def squares(n=5, function=square, executor=None, **how):
     watch = Watch("squares", n, "unit", False, how.pop("callback", None))
-    ways = work.placement("squares", executor, how.pop("devices", None))
+    placement = work.placement("squares", executor, how.pop("devices", None))
     like = lambda: 0
     fold = lambda state, number, result: (*state, int(result))
-    return work.run(Task(function, None, like), n, fold, (), watch, ways, **how)
+    return work.run(Task(function, None, like), n, fold, (), watch, placement, **how)
 
 
 # --- where units run, and from where they go on
@@ -190,9 +190,9 @@ def test_what_is_done_is_not_done_again(key, tmp_path, monkeypatch, same):
     call, done = CALLS["nominal"], []
     real = sys.modules["jast._src.core.nominal"]._unit
 
-    def unit(job, number, post):
+    def unit(job, number, context):
         done.append(number)
-        return real(job, number, post)
+        return real(job, number, context)
 
     monkeypatch.setattr(sys.modules["jast._src.core.nominal"], "_unit", unit)
 

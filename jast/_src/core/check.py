@@ -19,7 +19,7 @@ from jax import lax
 
 from jast import distributions as D
 from jast._src.core.actions import Quantiles, Samples, UniformBox, Wide
-from jast._src.core.signature import outline
+from jast._src.core.signature import signature_of
 from jast._src.core.simulator import Simulator, require_simulator
 from jast._src.core.traps import traps
 from jast._src.runtime._jax import is_traced, is_tracing, quick
@@ -314,8 +314,8 @@ def _probe(sim, actions):
     """LANES nominal episodes (HOSTED_LANES) and the undisturbed one, STEPS steps of each (all, of
     an episodic system).
     """
-    about = outline(sim)
-    has_mode = about.start.mode and about.disturbance.mode
+    signature = signature_of(sim)
+    has_mode = signature.start.mode and signature.disturbance.mode
 
     def episode(key, undisturbed):
         def choose(dist, t):

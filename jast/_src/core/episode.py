@@ -15,7 +15,7 @@ from jax import lax
 from jast import distributions as D
 from jast._src.core import rewards
 from jast._src.core.policy import Policy, nominal_policy
-from jast._src.core.signature import outline
+from jast._src.core.signature import signature_of
 from jast._src.core.simulator import Simulator, require_simulator
 from jast._src.core.transition import advance, begin, conclude
 from jast._src.runtime._jax import is_traced, quick
@@ -178,7 +178,7 @@ def replay(
         disturbances, x0, length = episode.disturbances, episode.x0, episode.length
     else:
         disturbances = episode
-    like = outline(sim)
+    like = signature_of(sim)
     x0 = like.x0 if x0 is None and not like.random_start else x0
     x0 = conform("replay: x0", x0, like.x0)
     rows = {jnp.shape(leaf)[0] if jnp.ndim(leaf) else -1 for leaf in jax.tree.leaves(disturbances)}

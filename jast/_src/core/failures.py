@@ -17,7 +17,7 @@ import jax
 import numpy as np
 
 from jast._src.core.episode import Episode, replay
-from jast._src.core.signature import outline
+from jast._src.core.signature import signature_of
 from jast._src.core.simulator import Simulator
 from jast._src.io import save_load
 from jast._src.io.data_frames import dataframe
@@ -178,7 +178,7 @@ class Failures:
 
 def empty(sim):
     """`Failures` with n = 0, of the shapes and dtypes of ``sim``."""
-    like = outline(sim)
+    like = signature_of(sim)
     zero = np.zeros(0, like.dtype)
     x0 = jax.tree.map(lambda s: np.zeros((0, *s.shape), s.dtype), like.x0)
     x = jax.tree.map(lambda s: np.zeros((0, sim.horizon, *s.shape), s.dtype), like.x)

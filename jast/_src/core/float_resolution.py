@@ -18,7 +18,7 @@ from jax import lax
 from jast import distributions as D
 from jast._src.core.actions import Wide
 from jast._src.core.counter_prng import COUNTER
-from jast._src.core.signature import outline
+from jast._src.core.signature import signature_of
 from jast._src.core.simulator import Simulator
 from jast._src.runtime._jax import quick
 from jast._src.runtime.host_errors import runs_on_host
@@ -71,7 +71,7 @@ def rounding_problem(sim: Simulator) -> str | None:
         return None
     found = probe(sim)
     # a system whose random start decides everything is as it is meant
-    return None if outline(sim).random_start and all(found.unmoved) else describe(found)
+    return None if signature_of(sim).random_start and all(found.unmoved) else describe(found)
 
 
 def describe(found: Probe) -> str | None:
@@ -178,7 +178,7 @@ def _five_paths(sim: Simulator, steps: int, keys: jax.Array) -> tuple[Any, ...]:
     states = jax.tree.map(
         lambda a: jnp.broadcast_to(jnp.asarray(a)[None], (5, *jnp.shape(a))), state
     )
-    widens = outline(sim).disturbance.closed  # where that costs no more
+    widens = signature_of(sim).disturbance.closed  # where that costs no more
 
     def step(i, t, state):
         words = keys[jnp.where((i == 1) & (t == when), 1, 2 + t)]

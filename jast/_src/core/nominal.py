@@ -19,7 +19,7 @@ from jast._src.core import rewards
 from jast._src.core.check import contract
 from jast._src.core.episode import Episode, rollout
 from jast._src.core.policy import undisturbed
-from jast._src.core.signature import outline
+from jast._src.core.signature import signature_of
 from jast._src.core.transition import Progress, advance, begin, conclude
 from jast._src.runtime import work
 from jast._src.runtime._jax import jit, quick
@@ -160,16 +160,16 @@ def nominal(
             f"nominal: episodes must be a whole number from 1 to 2^31 - 1, received {episodes!r}"
         )
     contract("nominal", sim)
-    ways = work.placement("nominal", executor, devices)
+    placement = work.placement("nominal", executor, devices)
     asked, before = int(episodes), incidents(sim)
-    about = outline(sim)
-    calm = about.start.mode and about.disturbance.mode
+    signature = signature_of(sim)
+    calm = signature.start.mode and signature.disturbance.mode
     quiet = rollout(key, sim, undisturbed(sim)) if calm else None  # draws nothing
     with (
         open_checkpoint("nominal", checkpoint, key, sim=sim, episodes=asked) as store,
         Watch("nominal", asked, "episode", progress, callback) as watch,
     ):
-        ran = _play(key, sim, asked, watch, ways._replace(store=store))
+        ran = _play(key, sim, asked, watch, placement._replace(store=store))
     episodes, failures, invalid, mean, first = ran.state
     before = new_incidents(before, incidents(sim)), ran.incidents
     settings = display.call_settings("nominal", key, episodes=asked)
@@ -239,7 +239,7 @@ def _play(
     """`runtime.work.UnitsRun` with `Seen` of all episodes, unless interrupted."""
     chunks = -(-episodes // LANES)
     job = Job(key, sim, episodes, min(-(-chunks // UNITS), CHUNKS))
-    seen = Seen(0, 0, 0, np.zeros((), outline(sim).dtype), None)
+    seen = Seen(0, 0, 0, np.zeros((), signature_of(sim).dtype), None)
     task = Task(_unit, job, lambda: Counts(*Counts._fields))
 
     def episodes_of(done: int) -> int:
@@ -249,7 +249,7 @@ def _play(
     return work.run(task, n, _add, seen, watch, where, size=episodes_of)
 
 
-def _unit(job: Job, number: int, post: UnitContext) -> Counts:
+def _unit(job: Job, number: int, context: UnitContext) -> Counts:
     end = min((number + 1) * job.chunks, -(-job.episodes // LANES))
     bounds = job.episodes, number * job.chunks, end
     count = _count_quickly if job.episodes <= BRIEF else _count
@@ -300,7 +300,7 @@ def _counts(key, sim, episodes, begin, end):
         return jax.tree.map(lambda a, b: a.at[i - begin].set(b), counts, new)
 
     none = jnp.zeros((CHUNKS,), jnp.int32)
-    counts = Counts(none, none, none, jnp.zeros((CHUNKS,), outline(sim).dtype), none)
+    counts = Counts(none, none, none, jnp.zeros((CHUNKS,), signature_of(sim).dtype), none)
     return lax.fori_loop(begin, end, chunk, counts)
 
 

@@ -29,7 +29,7 @@ import jax
 import jax.numpy as jnp
 from jax.tree_util import Partial
 
-from jast._src.core.signature import outline
+from jast._src.core.signature import signature_of
 from jast._src.core.simulator import Simulator
 from jast._src.runtime._jax import is_traced
 
@@ -333,7 +333,7 @@ def likelihood(sim: Simulator) -> LogLikelihood:
         >>> jast.rewards.likelihood(jast.simulators.walk1d()).density
         'mode'
     """
-    return LogLikelihood(outline(sim).density)
+    return LogLikelihood(signature_of(sim).density)
 
 
 def density_of(reward: Reward) -> Density:

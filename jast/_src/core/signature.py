@@ -1,6 +1,7 @@
 """What is known of a simulator before it runs: shapes, dtypes, and what its distributions offer.
 
-Whoever needs to know asks `outline`, at any place and as often as it likes: JAX keeps the answer.
+Whoever needs to know asks `signature_of`, at any place and as often as it likes: JAX keeps the
+answer.
 """
 
 import functools
@@ -15,7 +16,7 @@ from jast import distributions as D
 from jast._src.core.simulator import Simulator
 from jast._src.util.pytrees import with_strong_types
 
-__all__ = ["Offer", "Outline", "ask", "per_simulator", "outline"]
+__all__ = ["Offer", "Signature", "ask", "per_simulator", "signature_of"]
 
 _static = dict(metadata=dict(static=True))
 
@@ -53,8 +54,8 @@ class Offer:
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
-class Outline:
-    """See `outline`. A pytree whose leaves are the `jax.ShapeDtypeStruct` of x0, x and state."""
+class Signature:
+    """See `signature_of`. A pytree of the `jax.ShapeDtypeStruct` of x0, x and state."""
 
     x0: Any
     """Of the initial disturbance: ``()`` with one start."""
@@ -90,8 +91,8 @@ class Outline:
         return "mode" if self.start.mode and self.disturbance.mode else "raw"
 
 
-def outline(sim: Simulator) -> Outline:
-    """The `Outline` of ``sim``: each of its functions but ``step`` and ``is_terminal`` is traced
+def signature_of(sim: Simulator) -> Signature:
+    """The `Signature` of ``sim``: each of its functions but ``step`` and ``is_terminal`` is traced
     once, at a state that ``init`` makes; none is run.
 
     It depends on the functions and on the shapes and dtypes of their parameters alone, by which
@@ -99,12 +100,12 @@ def outline(sim: Simulator) -> Outline:
     and no tracer is held. What ``start``, ``init``, ``disturbance`` and ``evaluate`` raise passes
     through.
     """
-    return jax.eval_shape(_outlined, sim)
+    return jax.eval_shape(_traced_signature, sim)
 
 
 def ask(sim: Simulator, question: Callable[[Any, Any, Any], Any]) -> Any:
     """What ``question(p(x0), state, p(x | state))`` returns while all is traced: values of Python,
-    for what `Outline` does not say of distributions. What it raises passes through.
+    for what `Signature` does not say of distributions. What it raises passes through.
     """
     found = []
 
@@ -118,7 +119,8 @@ def ask(sim: Simulator, question: Callable[[Any, Any, Any], Any]) -> Any:
 
 def per_simulator(question: Callable[..., Any]) -> Callable[[Simulator], Any]:
     """``question(sim, p(x0), state, p(x | state))``, a function of a module whose answer has a
-    hash, as a function of a simulator. It is traced once for each kind of simulator, as `outline`.
+    hash, as a function of a simulator. It is traced once for each kind of simulator, as
+    `signature_of`.
     """
 
     def traced(sim: Simulator) -> _Answer:
@@ -141,12 +143,12 @@ def _first_state(sim: Simulator) -> tuple[Any, Any, Any, Any]:
     return start, x0, state, sim.disturbance(state)
 
 
-def _outlined(sim: Simulator) -> Outline:
+def _traced_signature(sim: Simulator) -> Signature:
     # traced: what is static travels in the structure of the result, so that it is kept with it
     start, x0, state, dist = _first_state(sim)
     x = D.sample(dist, jax.random.key(0))
     numbers = dist.log_prob(x), sim.evaluate(state)[1]
-    return Outline(
+    return Signature(
         x0=x0,
         x=x,
         state=state,

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 
 from jast import distributions as D
 from jast._src.core import rewards
-from jast._src.core.signature import outline
+from jast._src.core.signature import signature_of
 from jast._src.core.simulator import Simulator
 from jast._src.util.pytrees import with_strong_types
 
@@ -43,7 +43,7 @@ class Progress(NamedTuple):
 
 def blank(sim: Simulator, state: Any) -> Progress:
     """The `Progress` at ``state``, with nothing behind it."""
-    zero, no = jnp.zeros((), outline(sim).dtype), jnp.zeros((), bool)
+    zero, no = jnp.zeros((), signature_of(sim).dtype), jnp.zeros((), bool)
     return Progress(
         state=state,
         log_prob=zero,

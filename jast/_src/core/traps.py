@@ -11,7 +11,7 @@ from jax.custom_derivatives import SymbolicZero
 
 from jast import distributions as D
 from jast._src.core.float_resolution import Probe, describe, probe
-from jast._src.core.signature import outline, per_simulator
+from jast._src.core.signature import per_simulator, signature_of
 from jast._src.core.simulator import Simulator
 from jast._src.runtime.host_errors import runs_on_host
 from jast._src.util.pytrees import Key, with_strong_types
@@ -34,9 +34,9 @@ def traps(sim: Simulator) -> list[str]:
     """
     if runs_on_host(sim):
         return []
-    seen, about, (equations, level, keys) = probe(sim), outline(sim), _program(sim)
+    seen, signature, (equations, level, keys) = probe(sim), signature_of(sim), _program(sim)
     found = [f"step: {text}" for text in (describe(seen), _jumps(seen)) if text is not None]
-    found += _fixed_keys(about.state, seen, keys)
+    found += _fixed_keys(signature.state, seen, keys)
     if seen.distance_differs and level:
         found.append(
             "step: the miss distance depends on the disturbance, and its gradient is 0 everywhere:"
@@ -149,7 +149,7 @@ def _level(sim: Simulator) -> bool:
     """Whether the rules of derivatives alone say that the slopes of the miss distance by the floats
     of the disturbances are 0. Nothing is run or compiled; False where there are no such rules.
     """
-    leaves, tree = jax.tree.flatten(outline(sim).x)
+    leaves, tree = jax.tree.flatten(signature_of(sim).x)
     smooth = [i for i, a in enumerate(leaves) if jnp.issubdtype(a.dtype, jnp.floating)]
     found = []
 

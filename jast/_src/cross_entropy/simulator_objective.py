@@ -20,7 +20,7 @@ from jast._src.core.actions import Quantiles, UniformBox, quantiles
 from jast._src.core.check import contract
 from jast._src.core.episode import rollout
 from jast._src.core.rewards import LogLikelihood, as_pytree
-from jast._src.core.signature import outline
+from jast._src.core.signature import signature_of
 from jast._src.core.simulator import Simulator
 from jast._src.cross_entropy.gaussian import normal
 from jast._src.normal_space.sequences import latent_policy
@@ -151,16 +151,16 @@ def over(sim: Simulator, *, reward: Reward | None = None, actions: Actions | Non
             f" {actions!r}"
         )
     contract("over", sim)
-    about = outline(sim)
+    signature = signature_of(sim)
     box = isinstance(actions, UniformBox)
     for name, offer, other in (
-        ("start", about.start, ""),
-        ("disturbance", about.disturbance, "; give actions=jast.actions.uniform(low, high)"),
+        ("start", signature.start, ""),
+        ("disturbance", signature.disturbance, "; give actions=jast.actions.uniform(low, high)"),
     ):
         if not offer.quantile and not (box and name == "disturbance"):
             raise ValueError(f"over: {name}: {offer.lacking} has no quantile function{other}")
     contract("over", sim, actions)
-    density = about.density
+    density = signature.density
     return Stress(sim, LogLikelihood(density) if reward is None else as_pytree(reward), actions)
 
 
@@ -197,9 +197,9 @@ def _flat(sim: Simulator) -> tuple[jax.Array, Callable[[jax.Array], Any]]:
     """Zeros [D], in the widest float dtype of x0 and x, and the function from a point to the
     latents (of x0, of x [horizon, ...]).
     """
-    about = outline(sim)
+    signature = signature_of(sim)
 
     def zeros(like, *rows):
         return jax.tree.map(lambda s: jnp.zeros((*rows, *s.shape), D.float_dtype(s.dtype)), like)
 
-    return ravel_pytree((zeros(about.x0), zeros(about.x, sim.horizon)))
+    return ravel_pytree((zeros(signature.x0), zeros(signature.x, sim.horizon)))

@@ -14,7 +14,7 @@ from jast._src.core.simulator import Simulator
 from jast._src.estimate.estimate import Estimate, times_too_few
 from jast._src.estimate.population.population import episodes_a_second
 from jast._src.normal_space import transform
-from jast._src.normal_space.evaluate_points import judged
+from jast._src.normal_space.evaluate_points import evaluate_points
 from jast._src.runtime.host_errors import runs_on_host
 
 __all__ = [
@@ -109,7 +109,7 @@ def _episodes_a_second_on_host(key: jax.Array, sim: Simulator) -> float:
     while True:
         z = rng.standard_normal((n, transform.dimension(sim))).astype(transform.normal_numbers(sim))
         begun = time.perf_counter()
-        judged(sim, z)
+        evaluate_points(sim, z)
         spent = time.perf_counter() - begun
         if spent > TIMED_SECONDS or n >= MAX_TIMED_RUNS:
             return n / max(spent, 1e-9)

@@ -106,7 +106,7 @@ def double_loop(
     return found._replace(settings=settings, draws=None)
 
 
-def _simulate_chunk(shared, i, post):
+def _simulate_chunk(shared, i, context):
     key, *about = shared
     return _simulate_starts(jax.random.fold_in(key, i), *about)
 

@@ -17,7 +17,7 @@ from jast._src.estimate.gaussians.design_points import explained
 from jast._src.estimate.proposal_search.mixture_draws import log_ratio
 from jast._src.estimate.tilts import tilts
 from jast._src.estimate.tilts.tilts import Tilts, shape, simulate_points
-from jast._src.normal_space.evaluate_points import judged
+from jast._src.normal_space.evaluate_points import evaluate_points
 from jast._src.normal_space.pcn import WIDTHS, proposed
 from jast._src.normal_space.transform import dimension, normal_numbers
 
@@ -128,14 +128,14 @@ class PopulationSampler:
     def simulate(self, z):
         """The population of the points ``z`` [size, D]."""
         if self.covered is None:
-            o = judged(self.sim, z)
+            o = evaluate_points(self.sim, z)
             score = o.score
         else:
             q, threshold = self.covered
             if isinstance(q, Tilts):
                 o, log_q, _ = simulate_points(self.sim, q, z)
             else:
-                o = judged(self.sim, z)
+                o = evaluate_points(self.sim, z)
                 log_q = log_ratio(q, z, o.used)
             score = np.where(log_q > float(threshold), np.inf, o.score)
         self.evaluations += self.size
@@ -255,7 +255,7 @@ def bracket_boundary(key, sim, n):
     safe, failing = np.zeros_like(failures.z), failures.z
     for _ in range(BISECTIONS if len(failing) else 0):
         half = ((safe + failing) / 2).astype(failing.dtype)
-        fails = judged(sim, half).failure[:, None]
+        fails = evaluate_points(sim, half).failure[:, None]
         safe, failing = np.where(fails, safe, half), np.where(fails, half, failing)
     return safe, failing, sampler.evaluations + BISECTIONS * len(failing)
 

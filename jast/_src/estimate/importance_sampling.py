@@ -23,7 +23,7 @@ from jast._src.core.check import contract
 from jast._src.core.episode import rollout
 from jast._src.core.policy import nominal_policy
 from jast._src.core.rewards import log_likelihood
-from jast._src.core.signature import outline
+from jast._src.core.signature import signature_of
 from jast._src.core.transition import advance, begin, conclude
 from jast._src.estimate import weight_sums
 from jast._src.estimate.estimate import estimate_from_weights
@@ -201,14 +201,16 @@ def importance(
     settings = call_settings("importance", key, samples=samples, mode=mode, level=level)
     whole_key = key
     key, for_probes = jax.random.split(key)
-    ways = work.placement("importance", executor, devices)
+    placement = work.placement("importance", executor, devices)
     about = dict(sim=sim, proposal=proposal, samples=samples, mode=mode)
     reasons = [] if proposal.covers else _uncovered(for_probes, sim, proposal)
     lanes = chunk_size(samples)
     with open_checkpoint("importance", checkpoint, whole_key, **about) as store:
         shared = key, sim, proposal, lanes, to_horizon
         watch = Watch("importance", samples, "episode", progress, callback)
-        total, notes, lost = chunks(of_policies, shared, lanes, watch, ways._replace(store=store))
+        total, notes, lost = chunks(
+            of_policies, shared, lanes, watch, placement._replace(store=store)
+        )
     found = estimate_from_weights(
         "importance", total, level=level, reasons=[*reasons, *lost], notes=notes
     )
@@ -221,11 +223,11 @@ def chunk_size(samples: int) -> int:
     return -(-samples // -(-samples // LANES))
 
 
-def chunks(simulate, shared, lanes, watch, ways=work.HERE, plain=None):
+def chunks(simulate, shared, lanes, watch, placement=work.HERE, plain=None):
     """(`Sums`, notes, reasons against them) of all episodes of ``watch``, ``lanes`` at a time, as
     units of work.
 
-    ``simulate(shared, i, post)``: `Traces` of chunk i, a function of a module; of the last chunk
+    ``simulate(shared, i, context)``: `Traces` of chunk i, a function of a module; of the last chunk
     the first rows count. ``plain(i)``: which of its rows are the model's own draws.
     """
     samples = watch.total
@@ -243,7 +245,7 @@ def chunks(simulate, shared, lanes, watch, ways=work.HERE, plain=None):
 
     start = weight_sums.empty_sums(samples), 0
     with watch:
-        ran = work.run(task, -(-samples // lanes), fold, start, watch, ways, size=size)
+        ran = work.run(task, -(-samples // lanes), fold, start, watch, placement, size=size)
     total, done = ran.state
     short = work.describe_missing("episodes", ran, done, samples)
     if ran.left_out:
@@ -251,7 +253,7 @@ def chunks(simulate, shared, lanes, watch, ways=work.HERE, plain=None):
     return total, () if short is None else (f"interrupted {short}",), ()
 
 
-def of_policies(shared, i, post):
+def of_policies(shared, i, context):
     """`Traces` of chunk ``i``, of (key, simulator, proposal, its size, whether to the horizon)."""
     key, *about = shared
     return traces(jax.random.fold_in(key, i), *about)
@@ -268,7 +270,7 @@ def one_trace(key, sim, proposal, to_horizon=False, drawn=None, start_key=None):
     own, for_start, for_steps = choose_component(key, proposal)
     for_start = for_start if start_key is None else start_key
     own = own if drawn is None else drawn
-    dtype, (components,) = outline(sim).dtype, proposal.log_weights.shape
+    dtype, (components,) = signature_of(sim).dtype, proposal.log_weights.shape
 
     def weigh(ratio, p, distribution_of, x):
         """The log q_k - log p [K] so far, and whether p is 0."""

@@ -14,12 +14,12 @@ from jax import lax
 from jast._src.core.check import contract
 from jast._src.core.nominal import outcome
 from jast._src.core.rewards import log_likelihood
-from jast._src.core.signature import outline
+from jast._src.core.signature import signature_of
 from jast._src.estimate.estimate import Estimate, estimate_from_counts
 from jast._src.estimate.importance_sampling import Traces, chunks
 from jast._src.estimate.proposal_search.mixture_draws import plain_chunk, rows_of
 from jast._src.estimate.weighted_draws import with_source
-from jast._src.normal_space.evaluate_points import judged
+from jast._src.normal_space.evaluate_points import evaluate_points
 from jast._src.runtime import work
 from jast._src.runtime._jax import jit
 from jast._src.runtime.checkpoints import open_checkpoint
@@ -94,7 +94,7 @@ def monte_carlo(
     samples = whole_number(name, "samples", samples)
     level = checked_level(name, level)
     contract(name, sim)
-    by_points = outline(sim).closed
+    by_points = signature_of(sim).closed
     simulate = simulate_points if by_points else _simulate_keys
     lanes = lanes_of_points(sim) if by_points else CHUNK_EPISODES
     ways = work.placement(name, executor, devices)
@@ -114,12 +114,12 @@ def lanes_of_points(sim: Simulator) -> int:
     return 4 * rows_of(sim)
 
 
-def simulate_points(shared: tuple[Any, ...], i: int, post: Any) -> Traces:
+def simulate_points(shared: tuple[Any, ...], i: int, context: Any) -> Traces:
     """`Traces` of chunk ``i`` of the model, by normal numbers, in the program of
     `normal_space.evaluate_points`.
     """
     key, sim, lanes, samples = shared
-    o = judged(sim, plain_chunk(key, i, min(lanes, samples - i * lanes), sim))
+    o = evaluate_points(sim, plain_chunk(key, i, min(lanes, samples - i * lanes), sim))
     return _plain_traces(o.failure, o.invalid, o.length, o.distance)
 
 
@@ -128,7 +128,7 @@ def episode_keys(key: jax.Array, chunk: int, rows: np.ndarray) -> jax.Array:
     return jax.vmap(jax.random.fold_in, (None, 0))(jax.random.fold_in(key, chunk), rows)
 
 
-def _simulate_keys(shared, i, post):
+def _simulate_keys(shared, i, context):
     """As `simulate_points`, where distributions have no quantile function in closed form."""
     key, sim, lanes, samples = shared
     n = min(lanes, samples - i * lanes)
@@ -166,6 +166,6 @@ def _simulate_chunk(key, sim, n, size):
         new = jax.vmap(one)(i * size + jnp.arange(size, dtype=jnp.int32))
         return tuple(lax.dynamic_update_slice(a, b, (i * size,)) for a, b in zip(out, new))
 
-    dtypes = bool, bool, jnp.int32, outline(sim).dtype
+    dtypes = bool, bool, jnp.int32, signature_of(sim).dtype
     start = tuple(jnp.zeros(CHUNK_EPISODES, dtype) for dtype in dtypes)
     return lax.fori_loop(0, (n + size - 1) // size, block, start)

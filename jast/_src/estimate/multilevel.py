@@ -16,11 +16,11 @@ from jax import lax
 from jax.tree_util import Partial
 
 from jast import distributions as D
-from jast._src.core import actions as choices
+from jast._src.core import actions
 from jast._src.core.check import contract
 from jast._src.core.episode import rollout
 from jast._src.core.policy import Policy
-from jast._src.core.signature import ask, outline
+from jast._src.core.signature import ask, signature_of
 from jast._src.core.simulator import Simulator
 from jast._src.normal_space import sequences
 from jast._src.runtime._jax import jit
@@ -177,7 +177,7 @@ def failure_proposal(
 
 @partial(jit, static_argnums=(3, 4, 5))
 def _search(key, sim, settings, tilt_start, samples, iterations):
-    like = outline(sim)
+    like = signature_of(sim)
     first = (
         sequences.standard_normal(like.x0, 1) if tilt_start else (),
         sequences.standard_normal(like.x, sim.horizon),
@@ -233,7 +233,7 @@ def _play(key, sim, proposal):
     start, steps = proposal
     z0 = sequences.sample(for_noise, start, 0) if start != () else ()
     z = sequences.sample(for_noise, steps, 1)
-    player = sequences.latent_policy(sim, choices.quantiles(), jax.tree.map(lambda a: a[0], z0), z)
+    player = sequences.latent_policy(sim, actions.quantiles(), jax.tree.map(lambda a: a[0], z0), z)
     e = rollout(for_start, sim, player)._replace(states=None, disturbances=None)
     # W = f(X; u) / f(X; v) in the latents, in which f is N(0, 1); to the end of the episode, as
     # later steps decide nothing
@@ -280,4 +280,4 @@ def _tilts_start(sim: Simulator) -> bool:
     start, step = ask(sim, lambda start, state, dist: (D.untiltable(start), D.untiltable(dist)))
     if step is not None:
         raise ValueError(f"failure_proposal: disturbance: {step}")
-    return outline(sim).random_start and start is None
+    return signature_of(sim).random_start and start is None

@@ -20,7 +20,7 @@ from jast import distributions as D
 from jast._src.core.check import contract
 from jast._src.core.episode import Episode
 from jast._src.core.policy import Policy
-from jast._src.core.signature import ask, outline
+from jast._src.core.signature import ask, signature_of
 from jast._src.distributions.mixtures import blend
 from jast._src.normal_space.transform import latents
 from jast._src.runtime._jax import is_traced
@@ -106,7 +106,7 @@ def trace_proposal(
     """
     epsilon = _epsilon("trace_proposal", epsilon, mixing)
     contract("trace_proposal", sim)
-    recorded, tilt_start = _stacked(sim, episodes), tilt_start and outline(sim).random_start
+    recorded, tilt_start = _stacked(sim, episodes), tilt_start and signature_of(sim).random_start
     try:
         start, steps = latents(sim, recorded, tilt_start)
     except ValueError as error:
@@ -179,7 +179,7 @@ def policy_proposal(
         raise ValueError(
             f"policy_proposal: policy must be a jast.Policy, received {type(policy).__name__}"
         )
-    tilt_start = tilt_start and outline(sim).random_start
+    tilt_start = tilt_start and signature_of(sim).random_start
     share = epsilon if mixing == "step" else None
     strength = jnp.ones((1,), epsilon.dtype)
     log_weights = jnp.zeros((1,), epsilon.dtype)
@@ -256,7 +256,7 @@ def _stacked(sim, episodes):
             "trace_proposal: episodes must have at most one leading axis, of at least 1, received"
             f" lengths {[np.shape(b[2]) for b in batched]}"
         )
-    like = outline(sim)
+    like = signature_of(sim)
     full = jax.tree.map(lambda s: jax.ShapeDtypeStruct((sim.horizon, *s.shape), s.dtype), like.x)
     for x0, x, _ in batched:
         one = jax.tree.map(lambda a: a[0], (x0, x))

@@ -94,7 +94,7 @@ def subset_simulation(
     level = checked_level(name, level)
     transform.check(name, sim)
     require_episodes(name, sim, samples)
-    ways = work.placement(name, executor, devices)
+    placement = work.placement(name, executor, devices)
     about = dict(sim=sim, samples=samples, replicates=replicates)
     with (
         open_checkpoint(name, checkpoint, key, **about) as store,
@@ -108,7 +108,7 @@ def subset_simulation(
             lambda runs, number, run: (*runs, run),
             (),
             watch,
-            ways._replace(store=store),
+            placement._replace(store=store),
         )
     runs = ran.state
     short = work.describe_missing("populations", ran, len(runs), replicates)
@@ -119,7 +119,7 @@ def subset_simulation(
     return estimate_from_replicates(name, runs, samples, level, reasons)._replace(settings=settings)
 
 
-def _run_replicate(shared, number, post):
+def _run_replicate(shared, number, context):
     """The `Explored` of a population, of arrays."""
     keys, sim, samples = shared
     found = explore(keys[number], sim, samples, min_log_probability=MIN_LOG_PROBABILITY)

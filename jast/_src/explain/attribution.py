@@ -129,7 +129,7 @@ def attribution(
     key = jax.random.key(0) if key is None else key
     checks.check_random_key(name, key)
     g = failing_point(name, sim, episode)
-    quiet = g.judge(np.zeros((1, len(g.v)))).distance[0]
+    quiet = g.evaluate(np.zeros((1, len(g.v)))).distance[0]
     if not np.isfinite(quiet):
         raise ValueError(
             f"{name}: sim must have a finite miss distance when it is undisturbed, received {quiet}"
@@ -152,7 +152,7 @@ def attribution(
         method=method,
         parts=tuple(parts),
         residual=residual,
-        evaluations=g.judge.spent + cost,
+        evaluations=g.evaluate.spent + cost,
     )
 
 
@@ -163,7 +163,7 @@ def _affordable(g: EpisodePoint, permutations: int, budget: int | None) -> int:
     if budget is None:
         return permutations
     budget = checks.whole_number("attribution", "budget", budget, 1)
-    each, spent = max(np.count_nonzero(g.v), 1), g.judge.spent + 1  # one run is made twice
+    each, spent = max(np.count_nonzero(g.v), 1), g.evaluate.spent + 1  # one run is made twice
     affordable = (budget - spent) // each // 2 * 2
     if affordable < 2:
         raise ValueError(
@@ -186,7 +186,7 @@ def _shapley(g: EpisodePoint, quiet: float, key: jax.Array, permutations: int):
             # row k has the first k + 1 disturbances of the order
             points = np.zeros((d, len(g.v)))
             points[:, one] = np.tril(np.ones((d, d))) * g.v[one]
-            along = np.concatenate([[quiet], _checked_finite(g.judge(points).distance)])
+            along = np.concatenate([[quiet], _checked_finite(g.evaluate(points).distance)])
             seen[i, one] -= np.diff(along) / 2
     error = seen.std(axis=0, ddof=1) / np.sqrt(pairs) if pairs > 1 else np.full(len(g.v), np.nan)
     return seen.mean(axis=0), error, 0
@@ -202,7 +202,7 @@ def _integrated(g: EpisodePoint, quiet: float, key: jax.Array, permutations: int
 def _gradient(g: EpisodePoint, quiet: float, key: jax.Array, permutations: int):
     """Just outside of the failures, where the distance is not yet flat."""
     shares = 1 - np.geomspace(1e-5, 1, 2 * POINTS)
-    outside = shares[~g.judge(shares[:, None] * g.v).failure]
+    outside = shares[~g.evaluate(shares[:, None] * g.v).failure]
     if not len(outside):
         raise ValueError(
             'attribution: method="gradient" needs a point outside of the failures on the line'
@@ -220,7 +220,7 @@ METHODS: dict[str, Callable] = {
 
 
 def _gradients(g: EpisodePoint, points: np.ndarray) -> np.ndarray:
-    slopes = np.asarray(_slopes(g.sim, jnp.asarray(points, g.judge.dtype)), np.float64)
+    slopes = np.asarray(_slopes(g.sim, jnp.asarray(points, g.evaluate.dtype)), np.float64)
     if not np.isfinite(slopes).all() or not slopes.any():
         raise ValueError(
             "attribution: the miss distance has no finite gradient, or one of 0; expected"

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jax.tree_util import Partial
 
 from jast import distributions as D
-from jast._src.core.signature import outline
+from jast._src.core.signature import signature_of
 from jast._src.core.simulator import Simulator
 from jast._src.stress_testing.report import Report
 from jast._src.util.pytrees import select, with_strong_types
@@ -100,7 +100,7 @@ def regression(sim_a: Simulator, sim_b: Simulator) -> Simulator:
         >>> bool(jast.replay(both, jnp.concatenate([there, back, jnp.zeros(12)])).failure)
         True
     """
-    a, b = outline(sim_a), outline(sim_b)
+    a, b = signature_of(sim_a), signature_of(sim_b)
     for part, one, other in (("disturbance", a.x, b.x), ("start", a.x0, b.x0)):
         if _shapes(one) != _shapes(other):
             raise ValueError(

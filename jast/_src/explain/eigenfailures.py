@@ -10,7 +10,7 @@ import numpy as np
 
 from jast._src.core.counter_prng import numpy_generator
 from jast._src.core.episode import Episode
-from jast._src.core.signature import outline
+from jast._src.core.signature import signature_of
 from jast._src.core.simulator import Simulator
 from jast._src.estimate.estimate import Estimate
 from jast._src.estimate.gaussians.mixture_fit import effective_sample_size
@@ -249,7 +249,7 @@ def _modes_of(sim: Simulator, z: np.ndarray, length: np.ndarray, ways: Any) -> n
 
 def _align_ends(sim: Simulator, z: np.ndarray, length: np.ndarray) -> np.ndarray:
     """The points ``z`` [m, D] as late as the last of them: what was behind the end comes first."""
-    first, (m, d), last = count_numbers(outline(sim).x0), z.shape, int(length.max())
+    first, (m, d), last = count_numbers(signature_of(sim).x0), z.shape, int(length.max())
     steps = z[:, first:].reshape(m, sim.horizon, -1)
     at = (np.arange(last) - (last - length[:, None])) % last
     moved = np.take_along_axis(steps[:, :last], at[..., None], axis=1)

@@ -15,7 +15,7 @@ from jast import distributions as D
 from jast._src.core import rewards
 from jast._src.core.episode import Episode, play_back, rollout
 from jast._src.core.failures import Failures, identity
-from jast._src.core.signature import outline
+from jast._src.core.signature import signature_of
 from jast._src.core.simulator import Simulator
 from jast._src.normal_space.transform import side_by_side
 from jast._src.runtime._jax import jit
@@ -82,8 +82,11 @@ def gather_episodes(function: str, argument: str, sim: Simulator, given: Any) ->
             f"{function}: {argument} must have one leading axis, received the shape"
             f" {e.length.shape}"
         )
-    about, n = outline(sim), len(e.length)
-    for part, like, rows in ((e.x0, about.x0, ()), (e.disturbances, about.x, (sim.horizon,))):
+    signature, n = signature_of(sim), len(e.length)
+    for part, like, rows in (
+        (e.x0, signature.x0, ()),
+        (e.disturbances, signature.x, (sim.horizon,)),
+    ):
         wanted = jax.tree.map(lambda s, rows=rows: (n, *rows, *s.shape), like)
         if jax.tree.map(np.shape, part) != wanted:
             raise ValueError(

@@ -9,7 +9,7 @@ import numpy as np
 from jax.scipy.special import ndtr, ndtri
 
 from jast._src.core.episode import replay
-from jast._src.core.signature import outline
+from jast._src.core.signature import signature_of
 from jast._src.core.simulator import Simulator
 from jast._src.distributions.standardised import chances
 from jast._src.estimate.estimate import Estimate
@@ -62,8 +62,11 @@ def free_undecided(
     numbers that give it, and numbers behind the end of an episode, which decided nothing, as the
     model has them.
     """
-    about = outline(sim)
-    whole = [np.issubdtype(leaf.dtype, np.integer) for leaf in jax.tree.leaves((about.x0, about.x))]
+    signature = signature_of(sim)
+    whole = [
+        np.issubdtype(leaf.dtype, np.integer)
+        for leaf in jax.tree.leaves((signature.x0, signature.x))
+    ]
     if any(whole):
         chance = transform.side_by_side(sim, partial(_chances, sim), z, lanes=LANES)
         u = np.asarray(ndtr(-np.abs(z)))
@@ -81,7 +84,7 @@ def _chances(sim: Simulator, z: jax.Array) -> jax.Array:
     def one(e: Any) -> tuple[Any, Any]:
         states = jax.tree.map(lambda a: a[:-1], replay(sim, e).states)
         steps = jax.vmap(lambda s, x: chances(sim.disturbance(s), x))(states, e.disturbances)
-        return chances(sim.start(), e.x0) if outline(sim).random_start else (), steps
+        return chances(sim.start(), e.x0) if signature_of(sim).random_start else (), steps
 
     first, steps = jax.vmap(one)(transform.episodes(sim, z))
     return transform.flat(sim, first, steps)

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from jast._src.core.signature import outline
+from jast._src.core.signature import signature_of
 from jast._src.core.simulator import Simulator
 from jast._src.explain.episodes import FullEpisodes
 from jast._src.normal_space.episode_point import names_of_leaves
@@ -81,7 +81,7 @@ def feature_table(
 
 def _components(sim: Simulator, episodes: FullEpisodes) -> list[tuple[str, np.ndarray]]:
     """(name, values [n, horizon]) of each number of a disturbance."""
-    named = iter(names_of_leaves(outline(sim).x, "x"))
+    named = iter(names_of_leaves(signature_of(sim).x, "x"))
     leaves = map(np.asarray, jax.tree.leaves(episodes.disturbances))
     rows = [a.reshape(*a.shape[:2], -1) for a in leaves]
     return [(next(named), a[..., i]) for a in rows for i in range(a.shape[-1])]

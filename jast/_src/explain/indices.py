@@ -17,7 +17,7 @@ from jast._src.estimate.proposal_search.mixture_draws import resample
 from jast._src.explain.estimate_draws import UNRELIABLE, failing_draws, free_undecided, normalised
 from jast._src.normal_space import transform
 from jast._src.normal_space.episode_point import number_names, number_steps
-from jast._src.normal_space.evaluate_points import Judge
+from jast._src.normal_space.evaluate_points import PointEvaluator
 from jast._src.util import checks, display
 from jast._src.util.intervals import clopper_pearson, log_normal
 
@@ -158,7 +158,7 @@ def indices(
     w = normalised(log_w)
     p, n_eff = float(estimate.mean), float(effective_sample_size(log_w))
     samples = kept.samples * len(z) / np.count_nonzero(kept.failure)
-    judge, picks = Judge(sim), resample(log_w, draws, rng.random()) if draws else None
+    evaluate, picks = PointEvaluator(sim), resample(log_w, draws, rng.random()) if draws else None
     rows = []
     for i, (called, step) in enumerate(zip(number_names(sim), number_steps(sim), strict=True)):
         gain, each = _gain(z[:, i], w)
@@ -169,7 +169,7 @@ def indices(
         error = p / (1 - p) * math.sqrt(max(square, 0.0))
         total, ends = math.nan, (math.nan, math.nan)
         if picks is not None:
-            fails = int(_still_failing(judge, z[picks], i, rng))
+            fails = int(_still_failing(evaluate, z[picks], i, rng))
             # as many independent failures as both samples are worth
             n = max(int(1 / (1 / draws + 1 / n_eff)), 1)
             q = fails / draws
@@ -192,7 +192,7 @@ def indices(
         level=level,
         ess=n_eff,
         reliable=bool(estimate.reliable and n_eff >= RELIABLE),
-        evaluations=spent + judge.spent,
+        evaluations=spent + evaluate.spent,
     )
 
 
@@ -207,11 +207,13 @@ def _interval(first: float, error: float, c: np.ndarray, level: float) -> tuple[
     return first - half, first + half
 
 
-def _still_failing(judge: Judge, z: np.ndarray, i: int, rng: np.random.Generator) -> int:
+def _still_failing(
+    evaluate: PointEvaluator, z: np.ndarray, i: int, rng: np.random.Generator
+) -> int:
     """How many of the failures ``z`` still fail with number ``i`` drawn anew."""
     moved = z.copy()
     moved[:, i] = rng.standard_normal(len(z))
-    return np.count_nonzero(judge(moved).failure)
+    return np.count_nonzero(evaluate(moved).failure)
 
 
 def _gain(z: np.ndarray, w: np.ndarray) -> tuple[float, np.ndarray]:

@@ -128,7 +128,7 @@ def minimal(
         budget -= LAST
     slack = number(name, "slack", slack, lambda v: 0 <= v < np.inf, "0 or more")
     g = failing_point(name, sim, episode, most=budget)
-    if (farther := g._replace(v=(1 + slack) * g.v)).judge(farther.v[None]).failure[0]:
+    if (farther := g._replace(v=(1 + slack) * g.v)).evaluate(farther.v[None]).failure[0]:
         g = farther
     kept = _find_needed(g, orders, budget)
     v = _shrink(g, np.where(kept, g.v, 0.0), budget)
@@ -142,8 +142,8 @@ def minimal(
         episode=e,
         parts=_parts(sim, e, v, kept),
         numbers=int(g.outcome.used[0]),
-        evaluations=g.judge.spent,
-        complete=g.judge.spent < budget,
+        evaluations=g.evaluate.spent,
+        complete=g.evaluate.spent < budget,
     )
 
 
@@ -158,7 +158,7 @@ def _find_needed(g: EpisodePoint, orders: int, budget: int) -> np.ndarray:
     points = np.tile(g.v, (orders, 1))
     # of each order what lies before ``at`` is decided
     at = np.zeros(orders, int)
-    while (at < len(live)).any() and g.judge.spent < budget:
+    while (at < len(live)).any() and g.evaluate.spent < budget:
         points, at = _advance(g, points, order, at)
     counts = (points != 0).sum(axis=1)
     best = points[np.lexsort(((points**2).sum(axis=1), counts))[0]]
@@ -177,7 +177,7 @@ def _advance(g: EpisodePoint, points: np.ndarray, order: np.ndarray, at: np.ndar
         ends = [np.unique(np.linspace(low[i], high[i], SECTIONS + 1).round()) for i in rows]
         tried = [e.astype(int)[1 : None if first else -1] for e in ends]
         batch = [_at_mode(points[i], order[i, at[i] : e]) for i, t in zip(rows, tried) for e in t]
-        fails = iter(g.judge(np.stack(batch)).failure)
+        fails = iter(g.evaluate(np.stack(batch)).failure)
         for i, t in zip(rows, tried):
             good = [e for e in t if next(fails)]
             low[i] = max(good, default=low[i])
@@ -196,10 +196,10 @@ def _at_mode(point: np.ndarray, which: np.ndarray) -> np.ndarray:
 
 def _spare_one_by_one(g: EpisodePoint, point: np.ndarray, budget: int) -> np.ndarray:
     """``point`` without what can be spared one by one."""
-    while g.judge.spent < budget and (left := np.flatnonzero(point)).size:
+    while g.evaluate.spent < budget and (left := np.flatnonzero(point)).size:
         each = np.tile(point, (len(left), 1))
         each[np.arange(len(left)), left] = 0.0
-        fails = g.judge(each).failure
+        fails = g.evaluate(each).failure
         if not fails.any():
             break
         point = each[fails][np.argmax(np.abs(point[left[fails]]))]
@@ -213,7 +213,7 @@ def _shrink(g: EpisodePoint, point: np.ndarray, budget: int) -> np.ndarray:
     for _ in range(SWEEPS):
         before = point
         for i in left:
-            if g.judge.spent >= budget:
+            if g.evaluate.spent >= budget:
                 return point
             point = _scale(g, point, np.array([i]))
         if np.allclose(before, point, rtol=1e-3, atol=0):
@@ -230,7 +230,7 @@ def _scale(g: EpisodePoint, point: np.ndarray, which: np.ndarray) -> np.ndarray:
         factors = np.linspace(high, low, SECTIONS + 2)[1:-1]
         each = np.tile(point, (len(factors), 1))
         each[:, which] *= factors[:, None]
-        fails = g.judge(each).failure
+        fails = g.evaluate(each).failure
         reached = len(fails) if fails.all() else int(np.argmin(fails))
         low = factors[reached] if reached < len(fails) else low
         high = factors[reached - 1] if reached else high

@@ -7,7 +7,7 @@ import numpy as np
 
 from jast._src.core.counter_prng import numpy_generator
 from jast._src.core.episode import Episode
-from jast._src.core.signature import outline
+from jast._src.core.signature import signature_of
 from jast._src.core.simulator import Simulator
 from jast._src.estimate.estimate import Estimate
 from jast._src.estimate.proposal_search.mixture_draws import resample
@@ -16,7 +16,7 @@ from jast._src.estimate.weighted_draws import Draws
 from jast._src.explain.episodes import distinct_rows, gather_episodes, named_kinds
 from jast._src.normal_space import transform
 from jast._src.normal_space.episode_point import used_numbers
-from jast._src.normal_space.evaluate_points import Judge
+from jast._src.normal_space.evaluate_points import PointEvaluator
 from jast._src.normal_space.pcn import proposed
 from jast._src.search.refine.modes import Modes, owners
 from jast._src.util.pytrees import count_numbers
@@ -101,7 +101,7 @@ def find_seeds(function: str, sim: Simulator, given: Any, labels: Any, most: int
     if not len(e.length):
         raise ValueError(f"{function}: failures must hold at least one failure, received none")
     z = transform.normal_of(sim, e)
-    o = Judge(sim)(z)
+    o = PointEvaluator(sim)(z)
     if not e.failure.all() or not o.failure.any():
         raise ValueError(
             f"{function}: failures must all fail, received"
@@ -134,8 +134,8 @@ def _label_by_mode(function: str, sim: Simulator, seeds: Seeds, modes: Any) -> S
         return seeds
     best = gather_episodes(function, "modes", sim, modes[:MODES])
     heads = transform.normal_of(sim, best)
-    judge = Judge(sim)
-    o = judge(heads)
+    evaluate = PointEvaluator(sim)
+    o = evaluate(heads)
     z = np.concatenate([seeds.z, heads[o.failure]]).astype(heads.dtype)
     used = np.concatenate([seeds.used, o.used[o.failure]])
     label = owners(sim, transform.played(sim, z), best)
@@ -148,7 +148,7 @@ def _label_by_mode(function: str, sim: Simulator, seeds: Seeds, modes: Any) -> S
         log_weight=log_w,
         label=label,
         names=_mode_names(len(best.length)),
-        evaluations=seeds.evaluations + judge.spent,
+        evaluations=seeds.evaluations + evaluate.spent,
     )
 
 
@@ -166,7 +166,7 @@ def draw_variants(key: jax.Array, sim: Simulator, seeds: Seeds, n: int) -> Varia
     episode, in failures and near misses alike, and so is the time where it does not matter. All
     kinds of failures get the same number of chains.
     """
-    rng, judge = numpy_generator(key), Judge(sim)
+    rng, evaluate = numpy_generator(key), PointEvaluator(sim)
     kinds = np.unique(seeds.label)
     each = [_draw_seeds(rng, seeds, k, -(-n // len(kinds))) for k in kinds]
     seed = np.concatenate(each)
@@ -176,7 +176,7 @@ def draw_variants(key: jax.Array, sim: Simulator, seeds: Seeds, n: int) -> Varia
     near, misses = np.zeros_like(z), np.zeros(len(z), int)
     for scale in SCALES:
         to = _shift_in_time(rng, sim, z) if scale is None else _redraw(rng, z, scale)
-        o = judge(to)
+        o = evaluate(to)
         rejected = ~o.failure & ~o.invalid
         misses += rejected
         kept = rejected & (rng.random(len(z)) * misses < 1)
@@ -203,7 +203,7 @@ def draw_variants(key: jax.Array, sim: Simulator, seeds: Seeds, n: int) -> Varia
         group=group,
         near=jax.tree.map(lambda a: a[calm_rows], calm),
         near_group=near_group,
-        evaluations=judge.spent + len(z) + len(missed),
+        evaluations=evaluate.spent + len(z) + len(missed),
     )
 
 
@@ -216,7 +216,7 @@ def _redraw(rng: np.random.Generator, z: np.ndarray, scale: float) -> np.ndarray
 def _shift_in_time(rng: np.random.Generator, sim: Simulator, z: np.ndarray) -> np.ndarray:
     """``z`` [n, D] with the disturbances some steps later, in a ring."""
     n, steps = len(z), sim.horizon
-    start = count_numbers(outline(sim).x0)
+    start = count_numbers(signature_of(sim).x0)
     at = (np.arange(steps) - rng.integers(0, steps, (n, 1))) % steps
     rows = z[:, start:].reshape(n, steps, -1)
     moved = np.take_along_axis(rows, at[:, :, None], axis=1)

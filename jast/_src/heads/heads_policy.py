@@ -12,7 +12,7 @@ from jax.tree_util import Partial
 
 from jast import distributions as D
 from jast._src.core.policy import Policy
-from jast._src.core.signature import outline
+from jast._src.core.signature import signature_of
 from jast._src.core.simulator import Simulator
 from jast._src.distributions.flat_rows import flat, unflat
 from jast._src.heads.heads import Heads, observation, policy_logits, sample_bins
@@ -92,7 +92,7 @@ def as_policy(sim: Simulator, heads: Heads, actions: Actions, power: chex.Numeri
     """
     if heads.policy is None:
         raise ValueError("heads.as_policy: expected heads with a policy head, received none")
-    like = outline(sim).x
+    like = signature_of(sim).x
     if not all(jnp.issubdtype(s.dtype, jnp.floating) for s in jax.tree.leaves(like)):
         raise ValueError(f"heads.as_policy: expected a disturbance of floats, received {like}")
     return Policy(

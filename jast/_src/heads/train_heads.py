@@ -12,7 +12,7 @@ import numpy as np
 
 from jast import distributions as D
 from jast._src.core.check import contract
-from jast._src.core.signature import ask, outline
+from jast._src.core.signature import ask, signature_of
 from jast._src.core.simulator import Simulator
 from jast._src.heads.heads import (
     Heads,
@@ -101,10 +101,10 @@ def count_inputs(sim: Simulator, actions: Any, heads: str | Heads) -> tuple[int,
                 "forest: a rollout head needs disturbances with a distribution function; use"
                 f' heads="value", or actions.uniform: {e}'
             ) from e
-    about = outline(sim)
-    if about.observation is None:
+    signature = signature_of(sim)
+    if signature.observation is None:
         contract("forest", sim, observed=math.inf)  # raises: it says what is wrong with observe
-    return math.prod(about.observation), count_numbers(about.x)
+    return math.prod(signature.observation), count_numbers(signature.x)
 
 
 def with_moments(heads: Heads, n: int, d: int) -> Heads:
@@ -203,8 +203,8 @@ def train_heads(key, training, sim, actions, settings, batches):
 
 def _samples(heads, sim, actions, settings, batches):
     """What the policy head (None without one) and the value head learn from."""
-    about = outline(sim)
-    n, first = heads.inputs.mean.shape[0] - count_numbers(about.x), int(about.random_start)
+    signature = signature_of(sim)
+    n, first = heads.inputs.mean.shape[0] - count_numbers(signature.x), int(signature.random_start)
     bins = None
     if heads.policy is not None:
         seen = jnp.zeros((n,), jnp.float32)

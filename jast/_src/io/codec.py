@@ -172,9 +172,9 @@ def decode(node: Any, path: Any, arrays: dict[str, np.ndarray], given: Given) ->
 
 def check_episodes(path: Any, sim: Any, *values: Any) -> None:
     """ValueError unless those of ``values`` that are episodes are of ``sim``."""
-    from jast._src.core.signature import outline
+    from jast._src.core.signature import signature_of
 
-    like = outline(sim)
+    like = signature_of(sim)
     for e in values:
         if name_of(e) == "Episode":
             axes = np.ndim(e.length)
@@ -273,14 +273,14 @@ def _children_of(node: Any) -> tuple[list[str], list | None]:
 
 def _own(path: Any, given: Given, name: str, names: list[str]) -> Any:
     """The structure of one node of a class of the simulator's, or of the heads'."""
-    from jast._src.core.signature import outline
+    from jast._src.core.signature import signature_of
 
     if given.sim is None and given.heads is None:
         raise ValueError(
             f"load: {path} holds values of the class {name}, which only its simulator can restore:"
             " load(path, sim); of heads, load(path, heads=heads)"
         )
-    left = [] if given.sim is None else [outline(given.sim)]
+    left = [] if given.sim is None else [signature_of(given.sim)]
     left += [] if given.heads is None else [given.heads]
     while left:
         node = left.pop()

@@ -14,7 +14,7 @@ import jax
 import numpy as np
 
 from jast._src.core.episode import Episode, replay
-from jast._src.core.signature import outline
+from jast._src.core.signature import signature_of
 from jast._src.core.simulator import Simulator
 from jast._src.util.leaf_names import path_name
 
@@ -140,7 +140,7 @@ def from_json(path: PathLike, sim: Simulator) -> Episode:
             f"from_json: path must be a file from the page of a report, received {str(path)!r},"
             f" which is not one: {wrong!r}"
         ) from None
-    like, wholes = outline(sim), []
+    like, wholes = signature_of(sim), []
     for name, part in zip(("x0", "x"), parts, strict=True):
         pairs, treedef = jax.tree_util.tree_flatten_with_path(getattr(like, name))
         names = [path_name(at) for at, _ in pairs]

@@ -6,11 +6,11 @@ import jax
 import numpy as np
 
 from jast._src.core.episode import Episode
-from jast._src.core.signature import outline
+from jast._src.core.signature import signature_of
 from jast._src.core.simulator import Simulator
 from jast._src.distributions.flat_rows import unflat
 from jast._src.normal_space import transform
-from jast._src.normal_space.evaluate_points import Judge
+from jast._src.normal_space.evaluate_points import PointEvaluator
 from jast._src.normal_space.mode_coordinates import centred
 from jast._src.util.leaf_names import entry_places, leaf_name
 from jast._src.util.pytrees import count_numbers
@@ -34,7 +34,7 @@ class EpisodePoint(NamedTuple):
 
     sim: Simulator
     """Centred: 0 is the mode of every disturbance"""
-    judge: Judge
+    evaluate: PointEvaluator
     v: np.ndarray
     """[D] float64; 0 where a number decided nothing"""
     outcome: transform.Outcomes
@@ -45,7 +45,7 @@ def failing_point(
     name: str, sim: Simulator, episode: Episode, most: int | None = None
 ) -> EpisodePoint:
     """The `EpisodePoint` of an ``episode`` that must fail where it is replayed; ``most`` of its
-    `Judge`.
+    `PointEvaluator`.
     """
     if not isinstance(episode, Episode):
         raise ValueError(
@@ -61,11 +61,11 @@ def failing_point(
     of_modes = centred(sim)
     one = jax.tree.map(lambda a: np.asarray(a)[None], episode._replace(states=None))
     recorded = transform.normal_of(of_modes, one)[0].astype(np.float64)
-    judge = Judge(of_modes, most)
+    evaluate = PointEvaluator(of_modes, most)
     # the way to normal numbers and back rounds, and a refined failure lies on the edge of failing
     for lift in LIFTS if bool(episode.failure) else LIFTS[:1]:
         v = (1 + lift) * recorded
-        outcome = judge(v[None])
+        outcome = evaluate(v[None])
         if outcome.failure[0]:
             break
     else:
@@ -74,40 +74,40 @@ def failing_point(
             f" {int(outcome.length[0])} steps without a failure"
         )
     v = np.where(np.arange(len(v)) < outcome.used[0], v, 0.0)
-    return EpisodePoint(of_modes, judge, v, outcome)
+    return EpisodePoint(of_modes, evaluate, v, outcome)
 
 
 def like_disturbances(sim: Simulator, row: np.ndarray) -> tuple[Any, Any]:
     """The numbers ``row`` [D] in the shapes of x0 and of the disturbances [horizon, ...]."""
-    about = outline(sim)
-    start = count_numbers(about.x0)
+    signature = signature_of(sim)
+    start = count_numbers(signature.x0)
 
     def shaped(part: np.ndarray, like: Any) -> Any:
         return jax.tree.map(
             lambda a, s: np.asarray(a).astype(row.dtype).reshape(s.shape), unflat(part, like), like
         )
 
-    rows = [shaped(part, about.x) for part in row[start:].reshape(sim.horizon, -1)]
-    return shaped(row[:start], about.x0), jax.tree.map(lambda *a: np.stack(a), *rows)
+    rows = [shaped(part, signature.x) for part in row[start:].reshape(sim.horizon, -1)]
+    return shaped(row[:start], signature.x0), jax.tree.map(lambda *a: np.stack(a), *rows)
 
 
 def number_steps(sim: Simulator) -> np.ndarray:
     """[D]: the step that each number belongs to, from 1; 0 for those of the start."""
-    about = outline(sim)
-    start, each = count_numbers(about.x0), count_numbers(about.x)
+    signature = signature_of(sim)
+    start, each = count_numbers(signature.x0), count_numbers(signature.x)
     return np.concatenate([np.zeros(start, int), 1 + np.arange(sim.horizon * each) // max(each, 1)])
 
 
 def used_numbers(sim: Simulator, length: np.ndarray) -> np.ndarray:
     """[n]: how many of the numbers decided something in episodes of ``length`` [n] steps."""
-    about = outline(sim)
-    return count_numbers(about.x0) + length * count_numbers(about.x)
+    signature = signature_of(sim)
+    return count_numbers(signature.x0) + length * count_numbers(signature.x)
 
 
 def number_names(sim: Simulator) -> list[str]:
     """[D]: what each number is called: "x" or its field, with its place in an array."""
-    about = outline(sim)
-    return [*names_of_leaves(about.x0, "x0"), *names_of_leaves(about.x, "x") * sim.horizon]
+    signature = signature_of(sim)
+    return [*names_of_leaves(signature.x0, "x0"), *names_of_leaves(signature.x, "x") * sim.horizon]
 
 
 def names_of_leaves(like: Any, root: str) -> list[str]:

@@ -1,4 +1,4 @@
-"""Points of normal numbers judged by simulation, from the host, in one program whatever their
+"""Points of normal numbers evaluated by simulation, from the host, in one program whatever their
 number.
 """
 
@@ -17,14 +17,14 @@ from jast._src.runtime._jax import jit
 from jast._src.runtime.checkpoints import answer_once
 from jast._src.runtime.host_errors import runs_on_host
 
-__all__ = ["Judge", "judged", "lanes_of"]
+__all__ = ["PointEvaluator", "evaluate_points", "lanes_of"]
 
 LANES = 4096  # points of a call at most
 BLOCK = 128  # points that run side by side
 HELD = 2**20  # numbers that a call may take
 
 
-class Judge:
+class PointEvaluator:
     """Judges points of ``sim`` and counts the episodes, ``spent``.
 
     A black box runs for no more than ``most`` points: what is beyond comes back as invalid.
@@ -42,7 +42,7 @@ class Judge:
             room = max(min(n, self.most - self.spent), 0)
         self.spent += room
         if room == n:
-            return judged(self.sim, points)
+            return evaluate_points(self.sim, points)
         none = transform.Outcomes(
             failure=np.zeros(n, bool),
             distance=np.full(n, np.inf, self.dtype),
@@ -53,11 +53,11 @@ class Judge:
         )
         if not room:
             return none
-        found = judged(self.sim, points[:room])
+        found = evaluate_points(self.sim, points[:room])
         return jax.tree.map(lambda a, b: np.concatenate([a, b[room:]]), found, none)
 
 
-def judged(sim: Simulator, z: np.ndarray, play: Callable = transform.outcome) -> Any:
+def evaluate_points(sim: Simulator, z: np.ndarray, play: Callable = transform.outcome) -> Any:
     """`Outcomes` of the points ``z`` [n, D], on the host, or what ``play(sim, z)`` says of each.
     One program serves every ``n``; a black box runs once a point, in batches of ``n``.
     """

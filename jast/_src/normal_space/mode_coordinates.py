@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jax.tree_util import Partial
 
 from jast import distributions as D
-from jast._src.core.signature import outline
+from jast._src.core.signature import signature_of
 from jast._src.core.simulator import Simulator
 from jast._src.distributions.base import Wrapped
 
@@ -56,11 +56,11 @@ def centred(sim: Simulator) -> Simulator:
     Distributions without a mode, or whose mode is 0 already, stay as they are: they share compiled
     programs.
     """
-    about = outline(sim)
+    signature = signature_of(sim)
     changes = {}
-    if about.disturbance.mode and not about.disturbance.mode_is_median:
+    if signature.disturbance.mode and not signature.disturbance.mode_is_median:
         changes["disturbance"] = Partial(_of_state, sim.disturbance)
-    if about.random_start and about.start.mode and not about.start.mode_is_median:
+    if signature.random_start and signature.start.mode and not signature.start.mode_is_median:
         changes["start"] = Partial(_of_start, sim.start)
     return replace(sim, **changes)
 

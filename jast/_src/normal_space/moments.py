@@ -18,7 +18,7 @@ from jast._src.core.rewards import likelihood
 from jast._src.core.simulator import Simulator
 from jast._src.core.transition import advance, begin, conclude
 from jast._src.normal_space.design_point_descent import differentiable
-from jast._src.normal_space.evaluate_points import judged
+from jast._src.normal_space.evaluate_points import evaluate_points
 from jast._src.normal_space.transform import Outcomes, outcomes_of, policy_of
 from jast._src.runtime._jax import quick
 from jast._src.runtime.checkpoints import answer_once
@@ -45,7 +45,7 @@ def distances(sim: Simulator, z: np.ndarray) -> tuple[Outcomes, np.ndarray]:
     """`Outcomes` of the points ``z`` [n, D], and the miss distance at each moment [n, M]: at s_0 ..
     s_T, or at the end of a system that is judged there. NaN where an episode had failed, or ended.
     """
-    o, g = judged(sim, z, _play)
+    o, g = evaluate_points(sim, z, _play)
     return o, np.where(np.isfinite(g), g, np.nan).astype(np.float64)
 
 

@@ -19,13 +19,12 @@ import numpy as np
 from jax import lax
 
 from jast import distributions as D
-from jast._src.core import actions as choices
-from jast._src.core import rewards
+from jast._src.core import actions, rewards
 from jast._src.core.check import contract
 from jast._src.core.episode import Episode, play_back, rollout
 from jast._src.core.policy import Policy
 from jast._src.core.rewards import likelihood
-from jast._src.core.signature import outline
+from jast._src.core.signature import signature_of
 from jast._src.core.simulator import Simulator
 from jast._src.core.transition import Progress, advance, begin, conclude
 from jast._src.distributions.flat_rows import unflat
@@ -111,8 +110,8 @@ def check(function: str, sim: Simulator) -> None:
     function.
     """
     contract(function, sim)
-    about = outline(sim)
-    for name, offer in (("disturbance", about.disturbance), ("start", about.start)):
+    signature = signature_of(sim)
+    for name, offer in (("disturbance", signature.disturbance), ("start", signature.start)):
         if not offer.quantile:
             raise ValueError(
                 f"{function}: {name}: {offer.kind} has no quantile function;"
@@ -122,14 +121,16 @@ def check(function: str, sim: Simulator) -> None:
 
 def dimension(sim: Simulator) -> int:
     """D."""
-    about = outline(sim)
-    return count_numbers(about.x0) + sim.horizon * count_numbers(about.x)
+    signature = signature_of(sim)
+    return count_numbers(signature.x0) + sim.horizon * count_numbers(signature.x)
 
 
 def normal_numbers(sim: Simulator) -> Any:
     """The float dtype of z."""
-    about = outline(sim)
-    return jnp.result_type(*(D.float_dtype(s.dtype) for s in jax.tree.leaves((about.x0, about.x))))
+    signature = signature_of(sim)
+    return jnp.result_type(
+        *(D.float_dtype(s.dtype) for s in jax.tree.leaves((signature.x0, signature.x)))
+    )
 
 
 def _simulate(
@@ -192,8 +193,8 @@ def outcomes_of(sim: Simulator, end: Progress, length: jax.Array) -> Outcomes:
 
 def _used(sim, steps):
     """How many numbers the start and so many ``steps`` take."""
-    about = outline(sim)
-    return count_numbers(about.x0) + steps * count_numbers(about.x)
+    signature = signature_of(sim)
+    return count_numbers(signature.x0) + steps * count_numbers(signature.x)
 
 
 @jit
@@ -266,11 +267,11 @@ def _live(q):
 
 def policy_of(sim: Simulator, z: jax.Array) -> Policy:
     """The `Policy` that plays the one episode of ``z`` [D]."""
-    like = outline(sim)
+    like = signature_of(sim)
     size0 = count_numbers(like.x0)
     return latent_policy(
         sim,
-        choices.quantiles(),
+        actions.quantiles(),
         unflat(z[:size0], like.x0),
         jax.vmap(lambda row: unflat(row, like.x))(z[size0:].reshape(sim.horizon, -1)),
     )
@@ -323,4 +324,4 @@ def normal_of(sim: Simulator, given: Episode) -> np.ndarray:
 
 @quick
 def _points(sim, recorded):
-    return flat(sim, *latents(sim, recorded, outline(sim).random_start))
+    return flat(sim, *latents(sim, recorded, signature_of(sim).random_start))

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import jax
 import numpy as np
 
-from jast._src.core.signature import outline
+from jast._src.core.signature import signature_of
 from jast._src.core.simulator import Simulator
 from jast._src.io.codec import name_of
 from jast._src.plot import style
@@ -315,7 +315,7 @@ def _most_unusual(own: Series, behind: Series | None) -> list[str]:
 def _draw_disturbances(ax: Any, sim: Any, failure: Any) -> None:
     """The disturbances of a failure over its steps."""
     n = int(failure.length)
-    about = None if sim is None else outline(sim)
+    about = None if sim is None else signature_of(sim)
     normal = about is not None and about.disturbance.quantile and about.start.quantile
     first, steps = spreads(sim, failure) if normal else ((), failure.disturbances)
     found = [(f, 0, f.values[None]) for f in named_fields(first, "x0", lead=0)]

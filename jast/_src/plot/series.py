@@ -11,7 +11,7 @@ from jast._src.blackbox.simulator import Record, Standing
 from jast._src.core.episode import Episode, replay, rollout
 from jast._src.core.failures import Failures
 from jast._src.core.policy import undisturbed
-from jast._src.core.signature import outline
+from jast._src.core.signature import signature_of
 from jast._src.core.simulator import Simulator
 from jast._src.io.codec import name_of
 from jast._src.page.episode_data import far
@@ -148,7 +148,7 @@ def series_of(sim: Simulator, episodes: Episode) -> Series:
     "disturbance ...". Without states they are replayed; a black box with states is run once an
     episode then.
     """
-    like, states = outline(sim).state, episodes.states
+    like, states = signature_of(sim).state, episodes.states
     if states is None and not isinstance(like, Record):
         states = (_states if runs_on_host(sim) else _compiled_states)(sim, episodes)
     length = np.asarray(episodes.length)
@@ -173,7 +173,7 @@ def series_of(sim: Simulator, episodes: Episode) -> Series:
 
 def replays_without_calls(sim: Simulator) -> bool:
     """Whether `series_of` calls no black box."""
-    return not runs_on_host(sim) or isinstance(outline(sim).state, Record)
+    return not runs_on_host(sim) or isinstance(signature_of(sim).state, Record)
 
 
 def _states(sim: Simulator, episodes: Episode) -> Any:
@@ -237,8 +237,8 @@ def undisturbed_series(sim: Simulator) -> Series | None:
     """The `Series` of the undisturbed episode; None where a disturbance has neither a mode nor a
     median.
     """
-    about = outline(sim)
-    if not (about.start.mode and about.disturbance.mode):
+    signature = signature_of(sim)
+    if not (signature.start.mode and signature.disturbance.mode):
         return None
     quiet = rollout(jax.random.key(0), sim, undisturbed(sim))
     return series_of(sim, jax.tree.map(lambda a: a[None], quiet))

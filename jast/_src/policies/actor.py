@@ -13,7 +13,7 @@ import numpy as np
 from jax.scipy.special import ndtr
 
 from jast import distributions as D
-from jast._src.core.signature import ask, outline
+from jast._src.core.signature import ask, signature_of
 from jast._src.core.simulator import Simulator
 from jast._src.distributions.flat_rows import split
 from jast._src.heads.heads import Moments
@@ -57,7 +57,7 @@ def count_latents(sim: Simulator, function: str) -> tuple[int, int]:
     ValueError of ``function``, naming ``disturbance``, where x is not of floats or has no quantile
     function with an inverse.
     """
-    like = outline(sim)
+    like = signature_of(sim)
     if not _floats(like.x):
         kinds = ", ".join(f"{s.dtype}{list(s.shape)}" for s in jax.tree.leaves(like.x)) or "nothing"
         raise ValueError(f"{function}: disturbance: expected floats, received {kinds}")

@@ -5,7 +5,7 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 from jast._src.core.check import OBSERVED, contract
-from jast._src.core.signature import outline
+from jast._src.core.signature import signature_of
 from jast._src.core.simulator import Simulator
 from jast._src.policies.actor import count_latents
 from jast._src.policies.training_state import Config
@@ -43,7 +43,7 @@ class Asked:
         contract(function, sim, observed=OBSERVED)
         self.function, self.sim = function, sim
         self.n, self.n0 = count_latents(sim, function)
-        (self.m,) = outline(sim).observation
+        (self.m,) = signature_of(sim).observation
 
     def counts(self, **values: Any) -> list[int]:
         """Each as an int of at least 1."""

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 
 from jast._src.core.check import OBSERVED, contract
-from jast._src.core.signature import outline
+from jast._src.core.signature import signature_of
 from jast._src.io.codec import Given, check_fits
 from jast._src.policies.actor import count_latents, make_networks
 from jast._src.policies.failure_policy import FailurePolicy, assemble
@@ -49,7 +49,7 @@ def whole(path: Any, fields: dict[str, Any], given: Given) -> FailurePolicy:
     layers = learned.actor["params"]
     *hidden, outputs = (len(layers[f"Dense_{i}"]["bias"]) for i in range(len(layers)))
     (init, _), (apply, _) = make_networks(n, tuple(hidden), outputs // (2 * n + 1))
-    seen = jnp.zeros((outline(sim).observation[0] + 2,), jnp.float32)
+    seen = jnp.zeros((signature_of(sim).observation[0] + 2,), jnp.float32)
     check_fits(path, "sim", "actor", learned.actor, jax.eval_shape(init, jax.random.key(0), seen))
     start = ()
     if n0:

@@ -11,7 +11,7 @@ from typing import Any
 
 import jax
 
-from jast._src.core.signature import outline
+from jast._src.core.signature import signature_of
 from jast._src.core.simulator import Simulator
 from jast._src.runtime._jax import is_tracing
 
@@ -63,8 +63,8 @@ def require_episodes(function: str, sim: Simulator, samples: int) -> None:
     """`require` for the disturbances of ``samples`` episodes, which ``function`` holds at once,
     drawn and as they are used.
     """
-    about = outline(sim)
-    one = size(about.x0) + sim.horizon * size(about.x)
+    signature = signature_of(sim)
+    one = size(signature.x0) + sim.horizon * size(signature.x)
     require(function, 2 * samples * one, f"{samples} episodes at once", "use fewer samples")
 
 

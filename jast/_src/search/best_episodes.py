@@ -8,7 +8,7 @@ import numpy as np
 
 from jast._src.core import rewards
 from jast._src.core.episode import Episode
-from jast._src.core.signature import outline
+from jast._src.core.signature import signature_of
 from jast._src.core.simulator import Simulator
 from jast._src.search.driver import Log, finish
 from jast._src.search.lanes import Played, blank_episodes, distinct_episodes
@@ -81,4 +81,4 @@ def standard_reward(sim: Simulator) -> rewards.Standard:
     """The reward of searches that want failures alone, and of these the likeliest: log p of a
     failure, relative to the mode where the disturbances of ``sim`` have modes.
     """
-    return rewards.standard(density=outline(sim).density)
+    return rewards.standard(density=signature_of(sim).density)

@@ -13,12 +13,12 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from jast._src.core import actions as choices
+from jast._src.core import actions
 from jast._src.core.counter_prng import tree_keys
 from jast._src.core.episode import Episode, play_back
 from jast._src.core.failures import collect, merge
 from jast._src.core.rewards import LogLikelihood
-from jast._src.core.signature import outline
+from jast._src.core.signature import signature_of
 from jast._src.core.simulator import Simulator
 from jast._src.runtime._jax import is_tracing, jit
 from jast._src.runtime.host_errors import runs_on_host
@@ -83,13 +83,13 @@ def calibrate(sim: Simulator, density: str, widen: str) -> Calibration:
 def _calibrated(
     sim: Simulator, density: str, widths: tuple[float, ...], blind: bool, lanes: int
 ) -> Calibration:
-    key, real = tree_keys(jax.random.key(0), 1)[0], outline(sim).dtype
+    key, real = tree_keys(jax.random.key(0), 1)[0], signature_of(sim).dtype
     live, number = jnp.ones((lanes,), bool), jnp.arange(lanes, dtype=jnp.int32)
     table, reward = jnp.asarray(widths, real), LogLikelihood(density)
 
     def play(i: jax.Array) -> Played:
         keys = jax.vmap(jax.random.fold_in, (None, 0))(key, i * lanes + number)
-        drawn = choices.wide(table[i]) if len(widths) > 1 else choices.samples()
+        drawn = actions.wide(table[i]) if len(widths) > 1 else actions.samples()
 
         def draw_start(key, row, dist):
             return drawn.draw_start(key, dist)

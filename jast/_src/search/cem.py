@@ -20,7 +20,7 @@ from jax import lax
 from jast._src.core import actions as choices
 from jast._src.core.counter_prng import tree_keys
 from jast._src.core.episode import Episode
-from jast._src.core.signature import outline
+from jast._src.core.signature import signature_of
 from jast._src.core.simulator import Simulator, require_simulator
 from jast._src.normal_space import sequences
 from jast._src.runtime import work
@@ -318,7 +318,7 @@ def _propose(keys, sim, shares, plan, state):
     horizon, ...] those of x.
     """
     elite = jax.tree.map(lambda a: a[: plan.elites], state.elites.episode)
-    start = outline(sim).random_start
+    start = signature_of(sim).random_start
     known = jnp.where(elite.reward > -jnp.inf, 1, -1)
     parents = (
         (jax.tree.map(lambda a: a[:, None], elite.x0), known),
@@ -364,7 +364,9 @@ def _merge(elites, new):
 @partial(jax.jit, static_argnums=(1, 2, 3))
 def _first_state(sim, plan, trees, k, width, around=()):
     """No elites and the first proposals, of every tree."""
-    parts = zip(plan.kinds, (outline(sim).x0, outline(sim).x), (1, sim.horizon), strict=True)
+    parts = zip(
+        plan.kinds, (signature_of(sim).x0, signature_of(sim).x), (1, sim.horizon), strict=True
+    )
     proposals = tuple(
         sequences.standard_normal(like, steps, width)
         if kind == "latent" and jax.tree.leaves(like)

@@ -10,7 +10,7 @@ import numpy as np
 
 from jast._src.core import actions as choices
 from jast._src.core.failures import Failures
-from jast._src.core.signature import outline
+from jast._src.core.signature import signature_of
 from jast._src.core.simulator import Simulator
 from jast._src.normal_space.sequences import disturbance_at
 from jast._src.normal_space.transform import latents
@@ -26,9 +26,9 @@ def proposal_kinds(sim: Simulator, actions: Any) -> tuple[str, str]:
     "copy".
     """
     if isinstance(actions, choices.Quantiles | choices.Wide):
-        return "latent" if outline(sim).start.quantile else "copy", "latent"
+        return "latent" if signature_of(sim).start.quantile else "copy", "latent"
     if isinstance(actions, choices.UniformBox):  # a start is not of the box
-        return "latent" if outline(sim).start.quantile else "copy", "latent"
+        return "latent" if signature_of(sim).start.quantile else "copy", "latent"
     return "copy", "copy"
 
 
@@ -80,7 +80,7 @@ def latents_around(sim, actions, failures, settings):
     if not len(failures):
         return ()
     one = jax.tree.map(lambda a: jnp.asarray(a)[None], failures.best._replace(states=None))
-    about = outline(sim)
-    of_start = about.random_start and about.start.quantile
+    signature = signature_of(sim)
+    of_start = signature.random_start and signature.start.quantile
     z0, z = latents(sim, (one.x0, one.disturbances, one.length), of_start)
     return z0, jax.tree.map(lambda a: a[0], z)

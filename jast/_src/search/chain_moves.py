@@ -11,7 +11,7 @@ import numpy as np
 from jax import lax
 
 from jast import distributions as D
-from jast._src.core.signature import outline
+from jast._src.core.signature import signature_of
 from jast._src.core.simulator import Simulator
 from jast._src.distributions.flat_rows import unflat
 from jast._src.normal_space.pcn import proposed
@@ -164,7 +164,7 @@ def _exchanged(chains, widths, key, turn):
 
 def play(sim: Simulator, reward: Any, z: jax.Array, live: jax.Array) -> Played:
     """The episodes of the points ``z`` [n, D], with their disturbances."""
-    like = outline(sim)
+    like = signature_of(sim)
     size = count_numbers(like.x0)
     z0 = jax.vmap(lambda row: unflat(row[:size], like.x0))(z)
     steps = jax.vmap(jax.vmap(lambda row: unflat(row, like.x)))(
@@ -181,7 +181,7 @@ def play(sim: Simulator, reward: Any, z: jax.Array, live: jax.Array) -> Played:
 
 def _points(sim, z, played, live):
     """The `Points` of ``z`` [n, D], as they were played."""
-    like, e = outline(sim), played.episode
+    like, e = signature_of(sim), played.episode
     used = (count_numbers(like.x0) + e.length * count_numbers(like.x)).astype(jnp.int32)
     distance = jnp.where(live & ~played.invalid, e.distance, jnp.inf)
     return Points(z, used, e.failure & live, distance)

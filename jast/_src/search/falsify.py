@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jast._src.core.signature import outline
+from jast._src.core.signature import signature_of
 from jast._src.core.simulator import Simulator
 from jast._src.normal_space.transform import Outcomes, check, normal_numbers, outcome, played
 from jast._src.runtime._jax import jit
@@ -159,7 +159,7 @@ class _Search:
     """A `search.driver.Search`."""
 
     def __init__(self, sim: Simulator, seed: Any, batch: int, top: int):
-        like = outline(sim)
+        like = signature_of(sim)
         self.sim, self.reward, self.top = sim, standard_reward(sim), top
         self.seed, self.batch = seed, batch
         self.start_size, self.step_size = count_numbers(like.x0), count_numbers(like.x)

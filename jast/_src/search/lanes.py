@@ -14,7 +14,7 @@ import numpy as np
 from jax import lax
 
 from jast._src.core.episode import Episode
-from jast._src.core.signature import outline
+from jast._src.core.signature import signature_of
 from jast._src.core.transition import advance, begin, conclude
 from jast._src.runtime.host_errors import runs_on_host
 from jast._src.search.result import Trials
@@ -119,7 +119,7 @@ def play_lanes(sim, reward, keys, draw_start, draw, live, rows=None, record=Fals
     summed up is masked (and the state, where it is yet to be judged). Without ``judge`` an episodic
     system is not evaluated: for the disturbances of episodes whose outcome is known.
     """
-    like = outline(sim)
+    like = signature_of(sim)
     start = int(like.random_start)
     rows = ((), ()) if rows is None else rows
     if runs_on_host(sim):  # which runs nothing twice: what is not live does what another lane does
@@ -187,7 +187,7 @@ def blank_episodes(sim, n):
     """n episodes that were not played: reward -inf, distance inf, an `Episode` with its
     disturbances.
     """
-    like = outline(sim)
+    like = signature_of(sim)
     x0 = jax.tree.map(lambda s: jnp.zeros((n, *s.shape), s.dtype), like.x0)
     x = jax.tree.map(lambda s: jnp.zeros((n, sim.horizon, *s.shape), s.dtype), like.x)
     zero, length = jnp.zeros((n,), like.dtype), jnp.zeros((n,), jnp.int32)

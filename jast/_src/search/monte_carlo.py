@@ -15,7 +15,7 @@ from jax import lax
 
 from jast._src.core import actions as choices
 from jast._src.core.counter_prng import tree_keys
-from jast._src.core.signature import outline
+from jast._src.core.signature import signature_of
 from jast._src.core.simulator import Simulator
 from jast._src.runtime import work
 from jast._src.runtime._jax import jit, quick
@@ -163,7 +163,7 @@ def monte_carlo(
         return finish_traced(sim, reward, tally, best, found.reward[None])
 
     if record:
-        row = 3 * outline(sim).dtype.itemsize + 2  # three numbers and two bools
+        row = 3 * signature_of(sim).dtype.itemsize + 2  # three numbers and two bools
         records = f"the records of {episodes} episodes"
         require(name, 2 * episodes * row, records, "use fewer, or record=False")
 
@@ -222,7 +222,7 @@ class Job(NamedTuple):
     record: bool
 
 
-def _unit(job, number, post):
+def _unit(job, number, context):
     """Chunk ``number``: (`Found`, `Tally`, `Trials` or None)."""
     begin = number * job.stride
     end = min(begin + job.stride, job.episodes)
@@ -280,7 +280,7 @@ def _merged(found, new):
 
 
 def _nothing(sim, top):
-    zero, lowest = np.zeros((), np.int32), np.asarray(-np.inf, outline(sim).dtype)
+    zero, lowest = np.zeros((), np.int32), np.asarray(-np.inf, signature_of(sim).dtype)
     none = np.zeros(top, np.int32)
     nothing = Top(np.full(top, lowest), none.astype(np.uint32), none, none)
     return Found(zero > 0, lowest, zero, nothing)

@@ -13,12 +13,12 @@ from jast._src.core.episode import Episode
 from jast._src.core.failures import Failures
 from jast._src.io.data_frames import dataframe
 from jast._src.search.refine.refine import Refined
-from jast._src.util import display as results
+from jast._src.util import display
 
 __all__ = ["History", "SearchResult", "Trials", "table"]
 
 
-@results.printable()
+@display.printable()
 class History(NamedTuple):
     """How the search went, at C moments of it.
 
@@ -43,7 +43,7 @@ class History(NamedTuple):
         return self.failing
 
 
-@results.printable()
+@display.printable()
 class Trials(NamedTuple):
     """Every simulated episode of a search, [n, trees]: n of each tree, in the order in which they
     were simulated.
@@ -83,7 +83,7 @@ class Trials(NamedTuple):
         return dataframe(columns, ["tree", "episode"])
 
 
-@results.result_class("episodes")
+@display.result_class("episodes")
 class SearchResult(NamedTuple):
     """The outcome of a search; on the host, NumPy and Python numbers. Under `jax.jit` or `jax.vmap`
     all are traced arrays and ``failures`` is None.

@@ -10,7 +10,7 @@ import jax
 from jast._src.core import actions as choices
 from jast._src.core import rewards
 from jast._src.core.check import ACTIONS, contract
-from jast._src.core.signature import outline
+from jast._src.core.signature import signature_of
 from jast._src.core.simulator import Simulator
 from jast._src.runtime._jax import is_traced, is_tracing
 from jast._src.search.calibration import Calibration, calibrate
@@ -37,7 +37,7 @@ def default_actions(function: str, sim: Simulator) -> choices.Wide | choices.Sam
     where the simulator breaks its contract.
     """
     contract(function, sim)
-    return choices.wide() if outline(sim).disturbance.quantile else choices.samples()
+    return choices.wide() if signature_of(sim).disturbance.quantile else choices.samples()
 
 
 def prepare(
@@ -79,9 +79,9 @@ def _scaled(
     wide = isinstance(actions, choices.Wide) and actions.width is None
     if not (bare or wide):
         return reward, actions, None
-    about, widen = outline(sim), widen if wide else "never"
+    signature, widen = signature_of(sim), widen if wide else "never"
     given = getattr(reward, "density", None) if bare else "raw"
-    density = given or about.density
+    density = given or signature.density
     calibration = calibrate(sim, density, widen)
     told = calibration.near, calibration.rare, calibration.likely, calibration.width
     if not is_traced(told):

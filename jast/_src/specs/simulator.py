@@ -11,7 +11,7 @@ from jax.tree_util import Partial
 
 from jast._src.core.check import contract
 from jast._src.core.episode import Episode
-from jast._src.core.signature import outline
+from jast._src.core.signature import signature_of
 from jast._src.core.simulator import Simulator
 from jast._src.specs import monitor
 from jast._src.specs.formulas import Formula, predicates
@@ -118,9 +118,9 @@ def under(
         raise ValueError(f"under: samples must be a function of the state, received {samples!r}")
     contract("under", sim)
     samples = samples if samples is None else as_partial(samples)
-    about, dt = outline(sim), spacing("under", dt)
+    signature, dt = signature_of(sim), spacing("under", dt)
     watch = _Watch(sim=sim, formula=formula, samples=samples, dt=dt, total=0)
-    rows = jax.eval_shape(lambda: _samples_of(watch, _zeros(about.state)))
+    rows = jax.eval_shape(lambda: _samples_of(watch, _zeros(signature.state)))
     sizes = {a.shape[0] if a.ndim else 0 for a in jax.tree.leaves(rows)}
     if len(sizes) != 1 or 0 in sizes:
         raise ValueError(
@@ -131,7 +131,7 @@ def under(
     fits("under", formula, total, dt)
     watch = _Watch(sim=sim, formula=formula, samples=samples, dt=dt, total=total)
     shapes = jax.eval_shape(
-        lambda: margins("under", formula, _samples_of(watch, _zeros(about.state)))
+        lambda: margins("under", formula, _samples_of(watch, _zeros(signature.state)))
     )
     watched = dict(
         init=Partial(_init, watch),

@@ -13,7 +13,7 @@ from jast._src.core.actions import wide
 from jast._src.core.episode import Episode
 from jast._src.core.failures import empty
 from jast._src.core.rewards import likelihood
-from jast._src.core.signature import outline
+from jast._src.core.signature import signature_of
 from jast._src.core.simulator import Simulator
 from jast._src.estimate.gaussians.design_points import design_points
 from jast._src.estimate.host_populations import cool, explore
@@ -166,15 +166,17 @@ EXPLORERS = {
 
 def has_quantiles(sim: Simulator) -> bool:
     """Whether an episode of ``sim`` is a point of normal numbers."""
-    about = outline(sim)
-    return about.start.quantile and about.disturbance.quantile
+    signature = signature_of(sim)
+    return signature.start.quantile and signature.disturbance.quantile
 
 
 def divide_budget(sim: Simulator, budget: int) -> dict[str, int]:
     """The names of the explorers that work on ``sim``, with what each has of ``budget``
     evaluations.
     """
-    floats = all(jnp.issubdtype(s.dtype, jnp.floating) for s in jax.tree.leaves(outline(sim).x))
+    floats = all(
+        jnp.issubdtype(s.dtype, jnp.floating) for s in jax.tree.leaves(signature_of(sim).x)
+    )
     quantiles, differentiable = has_quantiles(sim), floats and not runs_on_host(sim)
     least, left = {}, budget
     for name, explorer in EXPLORERS.items():
@@ -198,7 +200,7 @@ def failures_at(sim: Simulator, points: np.ndarray) -> ExplorerResult:
 
 def failing_episodes(sim: Simulator, runs: list) -> Episode:
     """The failing ``runs`` of a black box as a batch of episodes, to be replayed; at least one."""
-    like, n = outline(sim), len(runs)
+    like, n = signature_of(sim), len(runs)
     zero, number = np.zeros(n, like.dtype), np.array([run.t for run in runs], np.int32)
     x0, x = (
         jax.tree.structure(tree).unflatten([np.stack(a) for a in zip(*leaves, strict=True)])

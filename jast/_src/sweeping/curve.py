@@ -18,13 +18,13 @@ import jax
 import numpy as np
 
 from jast._src.core.counter_prng import numpy_generator
-from jast._src.core.signature import outline
+from jast._src.core.signature import signature_of
 from jast._src.estimate.budgets import uses_populations
 from jast._src.estimate.population.descents import SETTINGS
 from jast._src.estimate.population.failure_sample import Sample
 from jast._src.estimate.population.search import MAX_DISAGREEMENT, MAX_WITNESS_ERROR
 from jast._src.estimate.redraw import redraw_failures
-from jast._src.normal_space.evaluate_points import judged
+from jast._src.normal_space.evaluate_points import evaluate_points
 from jast._src.normal_space.transform import Latent, dimension
 from jast._src.util.intervals import log_normal
 from jast._src.util.pytrees import count_numbers
@@ -76,7 +76,7 @@ class Row(NamedTuple):
         """The log of the share that fails in ``sim`` too, and by what each family moves it [G]; NaN
         where that is too much.
         """
-        fails = judged(sim, self.points).failure
+        fails = evaluate_points(sim, self.points).failure
         share = max(float(self.share @ fails), np.finfo(float).tiny)
         moves = np.bincount(self.family, self.share * (fails / share - 1))
         return (math.log(share) if moves @ moves < MAX_WITNESS_ERROR**2 else math.nan), moves
@@ -155,8 +155,8 @@ def _row_of(key, sim, r):
     else:  # draws of Gaussians, or of the model, which are independent
         most = SETTINGS.max_numbers // dimension(sim)
         points, log_w, length, _ = redraw_failures(sim, r.draws, most)
-        about, family = outline(sim), np.arange(len(points))
-        used = count_numbers(about.x0) + length * count_numbers(about.x)
+        signature, family = signature_of(sim), np.arange(len(points))
+        used = count_numbers(signature.x0) + length * count_numbers(signature.x)
     # what its own episode did not use may decide a neighbour's, so it is drawn from the model
     new = numpy_generator(key, 8).standard_normal(points.shape).astype(points.dtype)
     points = np.where(np.arange(points.shape[1]) < used[:, None], points, new)

@@ -13,7 +13,7 @@ import numpy as np
 from jast._src.core.nominal import Nominal
 from jast._src.estimate.estimate import guaranteed_words, is_doubtful
 from jast._src.io.data_frames import dataframe
-from jast._src.util import display as results
+from jast._src.util import display
 from jast._src.util.checks import number
 from jast.estimate import Estimate
 from jast.search import SearchResult
@@ -63,7 +63,7 @@ class Crossing(NamedTuple):
         return f"{self.name} {self.value:.6g} [{low:.6g}, {high:.6g}] at probability {self.level:g}"
 
 
-@results.result_class("episodes")
+@display.result_class("episodes")
 class Sweep(NamedTuple):
     """A table: what a function said of each of N systems. Row i is ``function(key_i,
     simulators[i])`` with ``key_i = jax.random.fold_in(key, i)``; where ``settings["follow"]``

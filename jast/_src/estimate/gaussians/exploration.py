@@ -12,7 +12,7 @@ from jast._src.estimate.gaussians.family import GaussianFamily, Points
 from jast._src.estimate.gaussians.mixture_fit import nearest_centre, unit_gaussians
 from jast._src.estimate.host_populations import bracket_boundary, cool, explore
 from jast._src.estimate.proposal_search.search_state import SearchState, add_batch
-from jast._src.normal_space.evaluate_points import judged
+from jast._src.normal_space.evaluate_points import evaluate_points
 
 __all__ = ["draw_model", "explore_failures"]
 
@@ -168,7 +168,7 @@ def _mirror(f, anchors):
     the nearest first, and evaluations.
     """
     lifted = -np.array(LIFTS)[:, None, None] * anchors
-    failure = judged(f.sim, lifted.reshape(-1, f.dimension).astype(f.dtype)).failure
+    failure = evaluate_points(f.sim, lifted.reshape(-1, f.dimension).astype(f.dtype)).failure
     failure = failure.reshape(lifted.shape[:2])
     points = lifted[np.argmax(failure, axis=0), np.arange(len(anchors))][failure.any(axis=0)]
     return distinct(points, f.directions), failure.size

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from jast._src.core.signature import outline
+from jast._src.core.signature import signature_of
 from jast._src.estimate.proposal_search.mixture_draws import resample
 from jast._src.estimate.weighted_draws import Draws, with_source
 from jast._src.util.pytrees import count_numbers
@@ -75,8 +75,8 @@ def sample_from(runs: Sequence[Descent]) -> Sample:
 
 def steps_of(sim: Simulator, used: np.ndarray) -> np.ndarray:
     """The steps [m] of episodes that ``used`` so many numbers."""
-    about = outline(sim)
-    return (used - count_numbers(about.x0)) // max(count_numbers(about.x), 1)
+    signature = signature_of(sim)
+    return (used - count_numbers(signature.x0)) // max(count_numbers(signature.x), 1)
 
 
 def independent_draws(

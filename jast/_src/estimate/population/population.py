@@ -124,7 +124,7 @@ def population(
     particles = whole_number(name, "particles", particles, MIN_PARTICLES)
     level = checked_level(name, level)
     transform.check(name, sim)
-    ways = work.placement(name, executor, devices)
+    placement = work.placement(name, executor, devices)
     with open_checkpoint(
         name, checkpoint, key, sim=sim, budget=budget, particles=particles
     ) as store:
@@ -136,7 +136,7 @@ def population(
             particles=particles,
             level=level,
             watched=(progress, callback),
-            ways=ways._replace(store=store),
+            ways=placement._replace(store=store),
         )
     return found._replace(settings=call_settings(name, key, budget=budget, level=level))
 

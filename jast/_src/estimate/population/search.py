@@ -202,7 +202,7 @@ class PopulationSearch:
             self.run(kind, int(points) // n, n)  # what whole blocks of lanes leave is one more
 
 
-def _run_population(shared, number, post):
+def _run_population(shared, number, context):
     """The `Descent` of a population."""
     key, sim, kind, n, capacity, first, most = shared
     by_width = kind.way == "width"

@@ -115,7 +115,7 @@ def _by_direction(q):
     return groups
 
 
-def _traces(shared, i, post):
+def _traces(shared, i, context):
     """`Traces` of chunk ``i`` of ``q``; ``members`` [K, K]: of which modes the shares are."""
     key, sim, q, members, lanes, samples = shared
     n = min(lanes, samples - i * lanes)

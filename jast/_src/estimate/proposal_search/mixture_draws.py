@@ -11,7 +11,7 @@ from jast._src.core.counter_prng import counter_key, numpy_generator
 from jast._src.core.simulator import Simulator
 from jast._src.estimate.gaussians.mixture_fit import log_sum, with_log_shares
 from jast._src.normal_space import transform
-from jast._src.normal_space.evaluate_points import judged, lanes_of
+from jast._src.normal_space.evaluate_points import evaluate_points, lanes_of
 
 __all__ = [
     "component_numbers",
@@ -47,7 +47,7 @@ def draw_mixture(
     log p - log q, log shares of the components [n, K]. On the host.
     """
     z = transform.place(q, u, e)
-    o = judged(sim, z)
+    o = evaluate_points(sim, z)
     log_q, shares = with_log_shares(log_joint(q, z, o.used))
     return z, o, -log_q, shares
 

@@ -20,7 +20,7 @@ from jax import lax
 from jast import distributions as D
 from jast._src.core.counter_prng import counter_key
 from jast._src.core.rewards import log_likelihood
-from jast._src.core.signature import outline
+from jast._src.core.signature import signature_of
 from jast._src.core.simulator import Simulator
 from jast._src.core.transition import Progress, advance, begin, blank, conclude
 from jast._src.estimate.splitting.levels import FRESH, Played
@@ -91,16 +91,16 @@ class DevicePaths:
 
 def require_paths(name: str, sim: Simulator, n: int) -> None:
     """ValueError where the states of ``n`` paths do not fit into memory."""
-    about = outline(sim)
-    row = size(about.state) + np.dtype(about.dtype).itemsize
+    signature = signature_of(sim)
+    row = size(signature.state) + np.dtype(signature.dtype).itemsize
     needed = 2 * n * (sim.horizon + 1) * row
     require(name, needed, f"the states of {n} episodes", "use fewer particles")
 
 
 def _empty(sim: Simulator, n: int) -> Store:
-    about, rows = outline(sim), sim.horizon + 1
-    states = jax.tree.map(lambda s: np.zeros((rows, n, *s.shape), s.dtype), about.state)
-    scores = np.zeros((rows, n), about.dtype)
+    signature, rows = signature_of(sim), sim.horizon + 1
+    states = jax.tree.map(lambda s: np.zeros((rows, n, *s.shape), s.dtype), signature.state)
+    scores = np.zeros((rows, n), signature.dtype)
     return jax.device_put(Store(states, scores, np.zeros(n, np.int32)))
 
 

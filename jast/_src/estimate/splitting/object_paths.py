@@ -13,7 +13,7 @@ import numpy as np
 
 from jast import distributions as D
 from jast._src.core.counter_prng import counter_key
-from jast._src.core.signature import outline
+from jast._src.core.signature import signature_of
 from jast._src.core.simulator import Simulator
 from jast._src.estimate.splitting.levels import FRESH, Played
 from jast._src.runtime._jax import quick
@@ -68,8 +68,8 @@ class ObjectPaths:
         self.sim, self.score, self.n, self.objects = sim, score, n, objects
         self.key, self.times = counter_key(key, 1), 0
         self.branches: list[list[Branch]] = [[] for _ in range(n)]
-        about = outline(sim)
-        self.blank = jax.tree.map(lambda s: np.zeros(s.shape, s.dtype), about.state)
+        signature = signature_of(sim)
+        self.blank = jax.tree.map(lambda s: np.zeros(s.shape, s.dtype), signature.state)
 
     def play(self, paths: np.ndarray, parents: np.ndarray, level: float) -> Played:
         """As `levels.Paths`."""

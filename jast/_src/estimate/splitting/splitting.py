@@ -12,7 +12,7 @@ import numpy as np
 
 from jast._src.core.check import contract
 from jast._src.core.float_resolution import rounding_problem
-from jast._src.core.signature import outline
+from jast._src.core.signature import signature_of
 from jast._src.estimate.estimate import Estimate, estimate_from_mean
 from jast._src.estimate.population.search import Answer, contradictions
 from jast._src.estimate.replicates import LOST_MODE_REMARK, MIN_REPLICATES, mean_of_replicates
@@ -153,7 +153,7 @@ def splitting(
     return found._replace(settings=settings)
 
 
-def _run(shared, number, post):
+def _run(shared, number, context):
     """The `Run` of a number, of arrays."""
     keys, sim, score, particles = shared
     objects = branching_objects(NAME, sim)
@@ -228,7 +228,7 @@ def _checked_score(sim, score):
         raise ValueError(f"{NAME}: score must be a function of the state, received {score!r}")
     score = traceable(as_partial(score))
     try:
-        value = jax.eval_shape(score, outline(sim).state)
+        value = jax.eval_shape(score, signature_of(sim).state)
     except Exception as error:
         raise ValueError(f"{NAME}: score raised {type(error).__name__}: {error}") from error
     if getattr(value, "shape", None) != () or not jnp.issubdtype(value.dtype, jnp.number):
@@ -239,7 +239,7 @@ def _checked_score(sim, score):
 def _check_states(sim, score):
     """ValueError where no state on the way tells anything."""
     advice = "use jast.estimate.failure_probability"
-    if sim.horizon == 1 and not outline(sim).random_start:
+    if sim.horizon == 1 and not signature_of(sim).random_start:
         raise ValueError(
             f"{NAME}: sim must have states on the way, where episodes can branch; received one of a"
             f" single step from one start: {advice}"

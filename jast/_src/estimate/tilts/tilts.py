@@ -21,7 +21,7 @@ from jax.typing import ArrayLike
 
 from jast._src.core.counter_prng import numpy_generator
 from jast._src.core.rewards import likelihood
-from jast._src.core.signature import outline, per_simulator
+from jast._src.core.signature import per_simulator, signature_of
 from jast._src.core.transition import advance, begin, conclude
 from jast._src.distributions.independent_parts import Parts, parts
 from jast._src.estimate.gaussians.mixture_fit import with_log_shares
@@ -188,7 +188,7 @@ def tilt_inputs(sim: Any, state: Any) -> jax.Array:
     """
     dtype = normal_numbers(sim)
     found = [] if sim.episodic else [jnp.asarray(sim.evaluate(state)[1]).reshape(1)]
-    if outline(sim).observation is not None:
+    if signature_of(sim).observation is not None:
         found.append(jnp.ravel(sim.observe(state))[:SEEN])
     seen = [a.astype(dtype) for a in found] or [jnp.zeros(1, dtype)]
     return jnp.nan_to_num(jnp.concatenate(seen), posinf=0.0, neginf=0.0)

@@ -16,7 +16,7 @@ import numpy as np
 from jax import lax
 
 from jast._src.core.rewards import log_likelihood
-from jast._src.core.signature import outline
+from jast._src.core.signature import signature_of
 from jast._src.core.simulator import Simulator, ravel
 from jast._src.search.go_explore.continued_runs import Point, start_point
 from jast._src.search.lanes import EMPTY_HASH, blank_episodes, fold_hash
@@ -50,7 +50,7 @@ class Cells(NamedTuple):
 def empty_cells(sim: Simulator, slots: int) -> Cells:
     """No state yet."""
     e, none = blank_episodes(sim, slots), jnp.zeros(slots, jnp.int32)
-    point = jax.eval_shape(partial(start_point, sim, log_likelihood), outline(sim).x0)
+    point = jax.eval_shape(partial(start_point, sim, log_likelihood), signature_of(sim).x0)
     return Cells(
         points=jax.tree.map(lambda s: jnp.zeros((slots, *s.shape), s.dtype), point),
         x0=e.x0,
@@ -63,9 +63,9 @@ def empty_cells(sim: Simulator, slots: int) -> Cells:
 
 def features(sim: Simulator, state: Any) -> jax.Array:
     """[F] the numbers of a state that cells are told by: what it shows, finite."""
-    seen = sim.observe if outline(sim).observation is not None else ravel
+    seen = sim.observe if signature_of(sim).observation is not None else ravel
     row = jnp.ravel(jnp.asarray(seen(state)))
-    row = row if jnp.issubdtype(row.dtype, jnp.floating) else row.astype(outline(sim).dtype)
+    row = row if jnp.issubdtype(row.dtype, jnp.floating) else row.astype(signature_of(sim).dtype)
     return jnp.clip(jnp.nan_to_num(row, nan=0.0), -1e6, 1e6)
 
 

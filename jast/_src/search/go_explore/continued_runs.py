@@ -14,9 +14,9 @@ import numpy as np
 from jax import lax
 
 from jast import distributions as D
-from jast._src.core import actions as choices
+from jast._src.core import actions
 from jast._src.core.episode import Episode
-from jast._src.core.signature import ask, outline
+from jast._src.core.signature import ask, signature_of
 from jast._src.core.simulator import Simulator
 from jast._src.core.transition import Progress, advance, begin, conclude
 from jast._src.distributions.flat_rows import unflat
@@ -106,7 +106,7 @@ def continue_runs(
         and the points after each of them [most, N], or ``()``.
     """
     (n,) = until.shape
-    xs = jax.tree.map(lambda s: jnp.zeros((most, n, *s.shape), s.dtype), outline(sim).x)
+    xs = jax.tree.map(lambda s: jnp.zeros((most, n, *s.shape), s.dtype), signature_of(sim).x)
     way = jax.tree.map(lambda a: jnp.zeros((most, *a.shape), a.dtype), points) if keep else ()
     until = jnp.minimum(until, sim.horizon)
 
@@ -166,9 +166,9 @@ def exploring_draws(sim: Simulator) -> tuple[Callable, Callable]:
     """``draw`` of `continue_runs` with a `Noise`, and likewise ``draw_start(key, noise, p(x0))``:
     draws of the model, of wider noise where it has quantile functions.
     """
-    about = outline(sim)
-    step = _fresh if about.disturbance.quantile else _sampled
-    return step, _fresh_start if about.start.quantile else _sampled_start
+    signature = signature_of(sim)
+    step = _fresh if signature.disturbance.quantile else _sampled
+    return step, _fresh_start if signature.start.quantile else _sampled_start
 
 
 def _sampled(key, t, own, dist):
@@ -199,11 +199,11 @@ def _normal(key, dist, dtype):
 
 def following_draws(sim: Simulator) -> tuple[Callable, Callable]:
     """The same two with a `Follow`."""
-    about = outline(sim)
+    signature = signature_of(sim)
     fresh, fresh_start = exploring_draws(sim)
     of_step, of_start = ask(sim, lambda start, state, dist: (_aside(dist), _aside(start)))
-    step = _changer(about.disturbance.mode, of_step)
-    start = _changer(about.start.mode, of_start)
+    step = _changer(signature.disturbance.mode, of_step)
+    start = _changer(signature.start.mode, of_start)
 
     def draw(key, t, own, dist):
         x = jax.tree.map(lambda a: a[jnp.minimum(t, a.shape[0] - 1)], own.rows)
@@ -231,7 +231,7 @@ def _changer(has_mode: bool, aside: bool) -> Callable:
         ways = [anew] * len(CHANGES)
         if has_mode:
             ways[1] = D.mode(dist)
-            ways[2] = choices.samples().near(x, dist, 1 - own.size)
+            ways[2] = actions.samples().near(x, dist, 1 - own.size)
         if aside:
             z = D.to_normal(dist, x)
             e = unflat(_normal(noise, dist, dtype), D.event_like(dist))

@@ -21,7 +21,7 @@ from jast._src.core.check import contract
 from jast._src.core.counter_prng import tree_keys
 from jast._src.core.episode import Episode
 from jast._src.core.rewards import as_pytree
-from jast._src.core.signature import outline
+from jast._src.core.signature import signature_of
 from jast._src.core.simulator import Simulator, require_simulator
 from jast._src.runtime import memory
 from jast._src.runtime.host_errors import runs_on_host
@@ -176,7 +176,7 @@ def go_explore(
 def _cell(name, sim, cell):
     """``cell`` as what `jax.jit` takes; ValueError where it does not work."""
     try:
-        told = jax.eval_shape(cell, outline(sim).state)
+        told = jax.eval_shape(cell, signature_of(sim).state)
     except Exception as error:
         said = f"{name}: cell raised {type(error).__name__} on a state: {error}"
         raise ValueError(said) from error
@@ -202,7 +202,7 @@ class _Search:
 
     def init(self) -> State:
         sim, n = self.sim, self.plan.traces
-        mark = jax.eval_shape(partial(features, sim), outline(sim).state)
+        mark = jax.eval_shape(partial(features, sim), signature_of(sim).state)
         best = BestEpisodes.none(sim, max(self.top, 64), mark)
         return State(empty_cells(sim, self.slots), best, _traces(blank_episodes(sim, n)), -1)
 

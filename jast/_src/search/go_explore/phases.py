@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from jast._src.core.signature import outline
+from jast._src.core.signature import signature_of
 from jast._src.runtime._jax import jit
 from jast._src.search.go_explore.archive import choose_cells, features, merge_cells
 from jast._src.search.go_explore.continued_runs import (
@@ -131,7 +131,7 @@ def improve_backward(key, sim, reward, plan, best, traces, begin, end, since, wh
         mine = jax.tree.map(lambda a: a[own_of], (traces, points, back))
         own = _ways(sim, keys, mine[0], mine[2])
         points, x0 = mine[1], mine[0].x0
-        if outline(sim).random_start:
+        if signature_of(sim).random_start:
             moved = jax.vmap(lambda k, own: draw_start(k, own, sim.start()))(keys, own)
             whole_way = jnp.broadcast_to(share >= 1, (n,))
             x0 = select_lanes(whole_way, moved, x0)
@@ -181,7 +181,7 @@ def _lanes(key, plan, at, begin, end):
 
 def _noise(sim, keys):
     """How each run draws, and three more uniform numbers of it."""
-    real = outline(sim).dtype
+    real = signature_of(sim).dtype
     u = jax.vmap(lambda k: jax.random.uniform(jax.random.fold_in(k, COINS), (5,), real))(keys)
     widths, shares = jnp.asarray(WIDTHS, real), jnp.asarray(PERSISTING, real)
     width = widths[(u[:, 3] * len(WIDTHS)).astype(jnp.int32)]
@@ -190,7 +190,7 @@ def _noise(sim, keys):
 
 def _ways(sim, keys, traces, back):
     """How each run follows its trace from step ``back`` on: a `Follow`."""
-    real = outline(sim).dtype
+    real = signature_of(sim).dtype
     u = jax.vmap(lambda k: jax.random.uniform(jax.random.fold_in(k, COINS), (5,), real))(keys)
     steps = jnp.maximum(traces.length - back, 1).astype(real)
     rate = jnp.where(u[:, 0] < 0.3, 1.0, steps ** -u[:, 1]).astype(real)

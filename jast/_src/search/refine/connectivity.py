@@ -4,9 +4,9 @@ from functools import partial
 
 import numpy as np
 
-from jast._src.core.signature import outline
+from jast._src.core.signature import signature_of
 from jast._src.core.simulator import Simulator
-from jast._src.normal_space.evaluate_points import Judge
+from jast._src.normal_space.evaluate_points import PointEvaluator
 from jast._src.normal_space.transform import unit
 from jast._src.util.pytrees import count_numbers
 
@@ -190,7 +190,7 @@ class Paths:
     """
 
     def __init__(self, sim: Simulator, budget: int):
-        self.sim, self.budget, self.judge = sim, budget, Judge(sim, most=budget)
+        self.sim, self.budget, self.judge = sim, budget, PointEvaluator(sim, most=budget)
         self.rng = np.random.default_rng(0)  # of moves: the same failures are always told the same
 
     @property
@@ -279,7 +279,7 @@ def moved_in_time(sim: Simulator, v: np.ndarray, steps: np.ndarray) -> np.ndarra
     """The points ``v`` [n, D] with their disturbances so many ``steps`` [n] later, sooner where
     negative; what comes in is the mode. On the host.
     """
-    first, n = count_numbers(outline(sim).x0), len(v)
+    first, n = count_numbers(signature_of(sim).x0), len(v)
     rows, t = v[:, first:].reshape(n, sim.horizon, -1), np.arange(sim.horizon) - steps[:, None]
     inside = (t >= 0) & (t < sim.horizon)
     moved = np.take_along_axis(rows, np.clip(t, 0, sim.horizon - 1)[..., None], axis=1)

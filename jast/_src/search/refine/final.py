@@ -10,7 +10,7 @@ import numpy as np
 from jast._src.core.episode import replay
 from jast._src.core.failures import collect, identity, merge
 from jast._src.core.rewards import Lexicographic, likelihood
-from jast._src.core.signature import outline
+from jast._src.core.signature import signature_of
 from jast._src.core.simulator import Simulator
 from jast._src.runtime.host_errors import runs_on_host
 from jast._src.runtime.jax_settings import run_in_thread
@@ -37,7 +37,7 @@ def default_share(sim: Simulator, reward: Any) -> float:
     `jast.search.refine` does, a `Lexicographic` one (unless its log p is raw though there are
     modes), else 0.
     """
-    same = isinstance(reward, Lexicographic) and reward.density == outline(sim).density
+    same = isinstance(reward, Lexicographic) and reward.density == signature_of(sim).density
     return SHARE if same else 0.0
 
 
@@ -62,8 +62,8 @@ def with_refine_share(
         ValueError: for a share that is negative or not finite, and for one above 0 in a traced
             search or of disturbances without a quantile function.
     """
-    about = outline(sim)
-    lacking = about.start.lacking or about.disturbance.lacking
+    signature = signature_of(sim)
+    lacking = signature.start.lacking or signature.disturbance.lacking
     if refine is None:
         share = 0.0 if lacking else share
     else:
@@ -116,7 +116,7 @@ def _refined(
     refined = refine(key, sim, given, budget=budget)
     before = dict(given=len(given), likeliest=float(given.best.reward))
     refined = refined._replace(
-        settings=refined.settings | before | dict(density=outline(sim).density)
+        settings=refined.settings | before | dict(density=signature_of(sim).density)
     )
     known = {identity(e) for e in archive}
     rows = [i for i, e in enumerate(refined.failures) if identity(e) not in known]

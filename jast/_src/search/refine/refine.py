@@ -11,7 +11,7 @@ from jast._src.core.counter_prng import numpy_generator
 from jast._src.core.episode import Episode, replay
 from jast._src.core.failures import Failures, collect, empty
 from jast._src.core.rewards import likelihood
-from jast._src.core.signature import outline
+from jast._src.core.signature import signature_of
 from jast._src.core.simulator import Simulator
 from jast._src.normal_space.mode_coordinates import centred
 from jast._src.normal_space.transform import check, normal_of, played, unit
@@ -202,7 +202,7 @@ class _Refinement:
     def __init__(self, rng, sim, given, gradients):
         self.rng, self.sim, self.given, self.gradients = rng, sim, given, gradients
         self.hosted = runs_on_host(sim)
-        self.of_modes, self.first = centred(sim), count_numbers(outline(sim).x0)
+        self.of_modes, self.first = centred(sim), count_numbers(signature_of(sim).x0)
         self.v = normal_of(self.of_modes, given)
         self.value = np.asarray(given.reward, np.float64)
         self.left = list(np.argsort(-self.value, kind="stable"))

@@ -12,7 +12,7 @@ import numpy as np
 from jast._src.core.episode import rollout
 from jast._src.core.rewards import likelihood
 from jast._src.core.simulator import Simulator
-from jast._src.normal_space.evaluate_points import judged
+from jast._src.normal_space.evaluate_points import evaluate_points
 from jast._src.normal_space.transform import Outcomes, policy_of
 from jast._src.runtime._jax import quick
 from jast._src.runtime.checkpoints import step_once
@@ -106,7 +106,7 @@ def _judged(sim: Simulator, v: np.ndarray) -> Outcomes:
     """
     n, k, d = v.shape
     parts = v if runs_on_host(sim) else v.reshape(1, n * k, d)
-    found = [judged(sim, part) for part in parts]
+    found = [evaluate_points(sim, part) for part in parts]
     return Outcomes(*(np.concatenate(a).reshape(n, k) for a in zip(*found, strict=True)))
 
 

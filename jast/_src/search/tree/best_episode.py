@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from jast._src.core.signature import outline
+from jast._src.core.signature import signature_of
 from jast._src.core.simulator import Simulator
 from jast._src.search.tree.packing import pack, shapes, unpack, width
 
@@ -72,7 +72,7 @@ def follows(tree):
 
 def feed_level(sim: Simulator) -> int:
     """The level at which floor(horizon / 2) steps remain (thesis Algorithm 9)."""
-    return sim.horizon - sim.horizon // 2 + outline(sim).random_start
+    return sim.horizon - sim.horizon // 2 + signature_of(sim).random_start
 
 
 def fed_of(tree, simulation, lane):
@@ -125,4 +125,4 @@ def packed(there, x):
 
 
 def _like(sim: Simulator) -> Any:
-    return shapes(outline(sim).x)
+    return shapes(signature_of(sim).x)

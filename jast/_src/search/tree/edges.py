@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from jast._src.core.signature import outline
+from jast._src.core.signature import signature_of
 from jast._src.distributions.flat_rows import flat
 from jast._src.heads.heads import observation
 from jast._src.search.tree.best_episode import fed_of
@@ -74,7 +74,7 @@ def edges_of(problem, tree, children, axes=None):
     seen, x = jax.vmap(one, in_axes=(axes, 0, 1, 1, 1), out_axes=1)(
         problem, tree.key, node.state, parent, slot
     )
-    if outline(problem.sim).random_start:  # the first level chooses x0
+    if signature_of(problem.sim).random_start:  # the first level chooses x0
         valid = valid & (parent > 0)
     return Edges(seen, x, visits.astype(jnp.int32), q, parent_q, valid)
 

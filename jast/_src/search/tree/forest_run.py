@@ -116,7 +116,7 @@ def grow_trees(
     counts = dict(trees=trees, prunes=prunes, simulations=simulations, top=top)
     given = {k: n for k, n in dict(threads=threads, lanes=lanes).items() if n is not None}
     trees, prunes, simulations, top, *_ = require_counts(method, **counts, **given)
-    before, ways = incidents(sim), work.placement(method, executor, devices)
+    before, placement = incidents(sim), work.placement(method, executor, devices)
     about = dict(sim=sim, chosen=chosen, reward=reward, actions=actions, exploration=exploration)
     about |= dict(memoize=memoize, record=bool(record), keep_trees=bool(keep_trees))
     about |= dict(heads=heads, head_settings=head_settings)
@@ -139,7 +139,7 @@ def grow_trees(
     if lanes is None and executor is not None:
         lanes = min(LANES, -(-job.at_once // max(job.at_once // EXECUTOR_LANES, 1)))
     if devices is not None:
-        threads = len(ways.devices)
+        threads = len(placement.devices)
     fitted, threads, lanes = fit(
         method, job.problem, wanted, job.at_once, threads, lanes, available, memoize == "auto"
     )
@@ -153,7 +153,9 @@ def grow_trees(
             first = store.choose_once(lambda: dict(memoize=fitted.memoize, lanes=lanes))
             fitted, lanes = fitted._replace(memoize=first["memoize"]), first["lanes"]
         job = job._replace(plan=fitted)
-        ran, training = grow_rounds(job, key, threads, lanes, watch, ways._replace(store=store))
+        ran, training = grow_rounds(
+            job, key, threads, lanes, watch, placement._replace(store=store)
+        )
     settings = job.settings | dict(prunes=job.plan.prunes, memoize=job.plan.memoize)
     if job.training is not None:
         settings |= _settings_of_heads(heads, job)

@@ -26,7 +26,7 @@ import numpy as np
 from jax import lax
 
 from jast._src.core.rewards import once
-from jast._src.core.signature import outline
+from jast._src.core.signature import signature_of
 from jast._src.core.simulator import Simulator, never
 from jast._src.core.transition import advance, begin, blank, conclude
 from jast._src.runtime._jax import is_traced
@@ -214,7 +214,7 @@ def widths(simulations, k, alpha):
 
 def levels(sim: Simulator) -> int:
     """Levels of choices in an episode: x_1 .. x_horizon, and x0 where the start is random."""
-    return sim.horizon + outline(sim).random_start
+    return sim.horizon + signature_of(sim).random_start
 
 
 def _pages(simulations, levels=0, table=None):
@@ -264,7 +264,7 @@ def make(problem, keys, simulations, memoize="node", pages=None, record=False, a
         )
 
     def origin(problem, key):
-        if outline(problem.sim).random_start:
+        if signature_of(problem.sim).random_start:
             # any state will do: the first level chooses x0
             x0 = problem.choice.actions.draw_start(key, problem.sim.start())
             return blank(problem.sim, begin(problem.sim, problem.reward, x0).state)
@@ -349,7 +349,7 @@ def choose_child(problem, node_key, slot, state):
     """One lane: (x0, x), the action of a node's child, for a first level that chooses x0 and for
     any other; x0 is ``()`` for a system with one start.
     """
-    sim, choice, chosen = problem.sim, problem.choice, outline(problem.sim).random_start
+    sim, choice, chosen = problem.sim, problem.choice, signature_of(problem.sim).random_start
     x0 = choice.child(node_key, slot, sim.start(), start=True) if chosen else ()
     return x0, choice.child(node_key, slot, sim.disturbance(state))
 
@@ -371,7 +371,7 @@ def choose_rollout(problem, key, tree_key, level, state, fed=()):
     """One lane: (x0, x) of a level of a rollout, by the keys of its simulation and its tree, and
     what it is fed.
     """
-    sim, choice, chosen = problem.sim, problem.choice, outline(problem.sim).random_start
+    sim, choice, chosen = problem.sim, problem.choice, signature_of(problem.sim).random_start
     simulation, key = key, jax.random.fold_in(key, level)
     x0 = choice.roll(key, tree_key, sim.start(), start=True) if chosen else ()
     dist = sim.disturbance(state)

@@ -6,7 +6,7 @@ from typing import Any
 
 import jax
 
-from jast._src.core.signature import outline
+from jast._src.core.signature import signature_of
 from jast._src.runtime.memory import available, readable, require
 from jast._src.search.tree.layout import Problem, most_lanes, pages_of
 from jast._src.search.tree.run import Plan, bytes_per_tree
@@ -83,7 +83,7 @@ def fit(
 
 def require_rewards(method: str, sim: Any, simulations: int, record: bool) -> None:
     """ValueError where what is kept of all ``simulations`` does not fit, with the numbers."""
-    real = outline(sim).dtype.itemsize
+    real = signature_of(sim).dtype.itemsize
     # rewards and outcomes as harvested and joined, and the rewards of those that ran
     row = 3 * real + 2 + (4 * real if record else 0)
     require(method, simulations * row, f"the rewards of {simulations} simulations", "use fewer")

@@ -155,7 +155,7 @@ def _keys(turn: Round, rows: np.ndarray) -> jax.Array:
     return jax.random.wrap_key_data(turn.words[rows], impl=COUNTER)
 
 
-def _one_group(turn: Round, number: int, post: UnitContext) -> TreeBatch:
+def _one_group(turn: Round, number: int, context: UnitContext) -> TreeBatch:
     problem, words, plan, lanes, chunk, candidates, before = turn
     group = np.arange(number * lanes, min((number + 1) * lanes, len(words)))
     keys, group = _keys(turn, np.resize(group, lanes)), group + before
@@ -169,12 +169,12 @@ def _one_group(turn: Round, number: int, post: UnitContext) -> TreeBatch:
             tree = jax.block_until_ready(
                 _grow(problem, tree, at, min(at + chunk, end), plan.memoize)
             )
-            post.more((min(at + chunk, end) - at) * len(group))
-            if post.stopped():
+            context.more((min(at + chunk, end) - at) * len(group))
+            if context.stopped():
                 break
         tree, roots = _prune(problem, tree, plan.children, plan.memoize)
         turns.append(jax.device_get(roots))
-        if post.stopped() or not np.asarray(tree.alive).any():
+        if context.stopped() or not np.asarray(tree.alive).any():
             break
     log, outcome, steps = (
         np.asarray(a)[..., : len(group)] for a in (tree.log, tree.outcome, tree.steps)
