@@ -17,7 +17,7 @@ from jast._src.estimate.gaussians.mixture_fit import effective_sample_size
 from jast._src.explain.episodes import gather_episodes
 from jast._src.explain.estimate_draws import UNRELIABLE, failing_draws, free_undecided, normalised
 from jast._src.normal_space import transform
-from jast._src.normal_space.episode_point import number_names, number_steps, used_numbers
+from jast._src.normal_space.episode_point import number_names, number_steps
 from jast._src.search.refine.modes import pointing
 from jast._src.util import checks, display
 from jast._src.util.pytrees import count_numbers
@@ -240,7 +240,7 @@ def _points(
 
 def _modes_of(sim: Simulator, z: np.ndarray, length: np.ndarray, ways: Any) -> np.ndarray:
     """The mode of each of the points ``z`` [m, D], by direction: [m]."""
-    known = np.arange(z.shape[1]) < used_numbers(sim, length)[:, None]
+    known = np.arange(z.shape[1]) < transform.used_numbers(sim, length)[:, None]
     heads = gather_episodes("eigenfailures", "failures", sim, ways)
     return pointing(
         sim, np.where(known, z, 0), length, transform.normal_of(sim, heads), heads.length

@@ -16,7 +16,6 @@ from jast._src.estimate.estimate import Estimate
 from jast._src.estimate.exceedance_and_times import draws_and_level
 from jast._src.estimate.redraw import dimension_of, redraw_failures
 from jast._src.normal_space import transform
-from jast._src.normal_space.episode_point import used_numbers
 
 __all__ = ["UNRELIABLE", "failing_draws", "free_undecided", "normalised"]
 
@@ -73,7 +72,7 @@ def free_undecided(
         u = u + chance * (rng.random(z.shape) - 0.5)
         moved = np.asarray(ndtri(jnp.clip(u, 1e-30, 1 - 1e-7))) * np.where(z > 0, -1, 1)
         z = np.where(chance > 0, moved, z)
-    undecided = np.arange(z.shape[1]) >= used_numbers(sim, length)[:, None]
+    undecided = np.arange(z.shape[1]) >= transform.used_numbers(sim, length)[:, None]
     return np.where(undecided, rng.standard_normal(z.shape), z).astype(z.dtype)
 
 

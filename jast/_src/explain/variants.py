@@ -15,7 +15,6 @@ from jast._src.estimate.redraw import is_proposal_of, redraw_failures
 from jast._src.estimate.weighted_draws import Draws
 from jast._src.explain.episodes import distinct_rows, gather_episodes, named_kinds
 from jast._src.normal_space import transform
-from jast._src.normal_space.episode_point import used_numbers
 from jast._src.normal_space.evaluate_points import PointEvaluator
 from jast._src.normal_space.pcn import proposed
 from jast._src.search.refine.modes import Modes, owners
@@ -76,7 +75,7 @@ def find_seeds(function: str, sim: Simulator, given: Any, labels: Any, most: int
         z, log_w, length, spent = redraw_failures(sim, kept, most)
         found = Seeds(
             z=z,
-            used=used_numbers(sim, length),
+            used=transform.used_numbers(sim, length),
             log_weight=log_w,
             label=np.zeros(len(z), int),
             names=("fails",),

@@ -8,7 +8,6 @@ import numpy as np
 from jast._src.core.episode import Episode
 from jast._src.core.signature import signature_of
 from jast._src.core.simulator import Simulator
-from jast._src.distributions.flat_rows import unflat
 from jast._src.normal_space import transform
 from jast._src.normal_space.evaluate_points import PointEvaluator
 from jast._src.normal_space.mode_coordinates import centred
@@ -22,7 +21,6 @@ __all__ = [
     "names_of_leaves",
     "number_names",
     "number_steps",
-    "used_numbers",
 ]
 
 # by how much farther from the mode an episode is taken where it does not fail as recorded
@@ -79,16 +77,7 @@ def failing_point(
 
 def like_disturbances(sim: Simulator, row: np.ndarray) -> tuple[Any, Any]:
     """The numbers ``row`` [D] in the shapes of x0 and of the disturbances [horizon, ...]."""
-    signature = signature_of(sim)
-    start = count_numbers(signature.x0)
-
-    def shaped(part: np.ndarray, like: Any) -> Any:
-        return jax.tree.map(
-            lambda a, s: np.asarray(a).astype(row.dtype).reshape(s.shape), unflat(part, like), like
-        )
-
-    rows = [shaped(part, signature.x) for part in row[start:].reshape(sim.horizon, -1)]
-    return shaped(row[:start], signature.x0), jax.tree.map(lambda *a: np.stack(a), *rows)
+    return jax.tree.map(lambda a: np.asarray(a).astype(row.dtype), transform.split_point(sim, row))
 
 
 def number_steps(sim: Simulator) -> np.ndarray:
@@ -96,12 +85,6 @@ def number_steps(sim: Simulator) -> np.ndarray:
     signature = signature_of(sim)
     start, each = count_numbers(signature.x0), count_numbers(signature.x)
     return np.concatenate([np.zeros(start, int), 1 + np.arange(sim.horizon * each) // max(each, 1)])
-
-
-def used_numbers(sim: Simulator, length: np.ndarray) -> np.ndarray:
-    """[n]: how many of the numbers decided something in episodes of ``length`` [n] steps."""
-    signature = signature_of(sim)
-    return count_numbers(signature.x0) + length * count_numbers(signature.x)
 
 
 def number_names(sim: Simulator) -> list[str]:

@@ -58,6 +58,8 @@ __all__ = [
     "played",
     "policy_of",
     "side_by_side",
+    "split_point",
+    "used_numbers",
     "unit",
 ]
 
@@ -121,8 +123,21 @@ def check(function: str, sim: Simulator) -> None:
 
 def dimension(sim: Simulator) -> int:
     """D."""
+    return used_numbers(sim, sim.horizon)
+
+
+def used_numbers(sim: Simulator, steps: Any) -> Any:
+    """How many numbers the start and so many ``steps`` take."""
     signature = signature_of(sim)
-    return count_numbers(signature.x0) + sim.horizon * count_numbers(signature.x)
+    return count_numbers(signature.x0) + steps * count_numbers(signature.x)
+
+
+def split_point(sim: Simulator, z: Any) -> tuple[Any, Any]:
+    """The numbers of x0 and those of the disturbances, [horizon, ...], of a point ``z`` [D]."""
+    like = signature_of(sim)
+    start = count_numbers(like.x0)
+    steps = z[start:].reshape(sim.horizon, -1)
+    return unflat(z[:start], like.x0), jax.vmap(lambda row: unflat(row, like.x))(steps)
 
 
 def normal_numbers(sim: Simulator) -> Any:
@@ -176,7 +191,7 @@ def outcome_by_level(sim: Simulator, z: jax.Array, level: Any) -> tuple[Outcomes
     came to the ``level``.
     """
     end, length, steps = _simulate(sim, z, likelihood(sim), level)
-    return outcomes_of(sim, end, length)._replace(log_p=None), _used(sim, steps)
+    return outcomes_of(sim, end, length)._replace(log_p=None), used_numbers(sim, steps)
 
 
 def outcomes_of(sim: Simulator, end: Progress, length: jax.Array) -> Outcomes:
@@ -184,17 +199,11 @@ def outcomes_of(sim: Simulator, end: Progress, length: jax.Array) -> Outcomes:
     return Outcomes(
         failure=end.failure,
         distance=end.distance,
-        used=_used(sim, length),
+        used=used_numbers(sim, length),
         length=length,
         invalid=end.invalid,
         log_p=end.reward,
     )
-
-
-def _used(sim, steps):
-    """How many numbers the start and so many ``steps`` take."""
-    signature = signature_of(sim)
-    return count_numbers(signature.x0) + steps * count_numbers(signature.x)
 
 
 @jit
@@ -267,14 +276,7 @@ def _live(q):
 
 def policy_of(sim: Simulator, z: jax.Array) -> Policy:
     """The `Policy` that plays the one episode of ``z`` [D]."""
-    like = signature_of(sim)
-    size0 = count_numbers(like.x0)
-    return latent_policy(
-        sim,
-        actions.quantiles(),
-        unflat(z[:size0], like.x0),
-        jax.vmap(lambda row: unflat(row, like.x))(z[size0:].reshape(sim.horizon, -1)),
-    )
+    return latent_policy(sim, actions.quantiles(), *split_point(sim, z))
 
 
 def played(sim: Simulator, z: np.ndarray) -> Episode:

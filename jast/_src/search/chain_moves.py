@@ -11,14 +11,11 @@ import numpy as np
 from jax import lax
 
 from jast import distributions as D
-from jast._src.core.signature import signature_of
 from jast._src.core.simulator import Simulator
-from jast._src.distributions.flat_rows import unflat
 from jast._src.normal_space.pcn import proposed
-from jast._src.normal_space.transform import dimension, normal_numbers
+from jast._src.normal_space.transform import dimension, normal_numbers, split_point, used_numbers
 from jast._src.runtime._jax import jit
 from jast._src.search.lanes import Played, Tally, play_lanes
-from jast._src.util.pytrees import count_numbers
 
 __all__ = ["Chains", "Points", "draw_wider", "move_chains", "no_points"]
 
@@ -164,12 +161,7 @@ def _exchanged(chains, widths, key, turn):
 
 def play(sim: Simulator, reward: Any, z: jax.Array, live: jax.Array) -> Played:
     """The episodes of the points ``z`` [n, D], with their disturbances."""
-    like = signature_of(sim)
-    size = count_numbers(like.x0)
-    z0 = jax.vmap(lambda row: unflat(row[:size], like.x0))(z)
-    steps = jax.vmap(jax.vmap(lambda row: unflat(row, like.x)))(
-        z[:, size:].reshape(len(z), sim.horizon, -1)
-    )
+    z0, steps = jax.vmap(partial(split_point, sim))(z)
     rows = jax.tree.map(lambda a: a[None], z0), jax.tree.map(lambda a: jnp.moveaxis(a, 1, 0), steps)
     keys = jax.vmap(jax.random.key)(jnp.zeros(len(z), jnp.uint32))
 
@@ -181,8 +173,8 @@ def play(sim: Simulator, reward: Any, z: jax.Array, live: jax.Array) -> Played:
 
 def _points(sim, z, played, live):
     """The `Points` of ``z`` [n, D], as they were played."""
-    like, e = signature_of(sim), played.episode
-    used = (count_numbers(like.x0) + e.length * count_numbers(like.x)).astype(jnp.int32)
+    e = played.episode
+    used = used_numbers(sim, e.length).astype(jnp.int32)
     distance = jnp.where(live & ~played.invalid, e.distance, jnp.inf)
     return Points(z, used, e.failure & live, distance)
 

@@ -18,16 +18,14 @@ import jax
 import numpy as np
 
 from jast._src.core.counter_prng import numpy_generator
-from jast._src.core.signature import signature_of
 from jast._src.estimate.budgets import uses_populations
 from jast._src.estimate.population.descents import SETTINGS
 from jast._src.estimate.population.failure_sample import Sample
 from jast._src.estimate.population.search import MAX_DISAGREEMENT, MAX_WITNESS_ERROR
 from jast._src.estimate.redraw import redraw_failures
 from jast._src.normal_space.evaluate_points import evaluate_points
-from jast._src.normal_space.transform import Latent, dimension
+from jast._src.normal_space.transform import Latent, dimension, used_numbers
 from jast._src.util.intervals import log_normal
-from jast._src.util.pytrees import count_numbers
 from jast.estimate import Estimate
 
 if TYPE_CHECKING:
@@ -155,8 +153,8 @@ def _row_of(key, sim, r):
     else:  # draws of Gaussians, or of the model, which are independent
         most = SETTINGS.max_numbers // dimension(sim)
         points, log_w, length, _ = redraw_failures(sim, r.draws, most)
-        signature, family = signature_of(sim), np.arange(len(points))
-        used = count_numbers(signature.x0) + length * count_numbers(signature.x)
+        family = np.arange(len(points))
+        used = used_numbers(sim, length)
     # what its own episode did not use may decide a neighbour's, so it is drawn from the model
     new = numpy_generator(key, 8).standard_normal(points.shape).astype(points.dtype)
     points = np.where(np.arange(points.shape[1]) < used[:, None], points, new)
