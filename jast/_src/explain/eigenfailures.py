@@ -10,17 +10,15 @@ import numpy as np
 
 from jast._src.core.counter_prng import numpy_generator
 from jast._src.core.episode import Episode
-from jast._src.core.signature import signature_of
 from jast._src.core.simulator import Simulator
 from jast._src.estimate.estimate import Estimate
 from jast._src.estimate.gaussians.mixture_fit import effective_sample_size
 from jast._src.explain.episodes import gather_episodes
 from jast._src.explain.estimate_draws import UNRELIABLE, failing_draws, free_undecided, normalised
 from jast._src.normal_space import transform
-from jast._src.normal_space.episode_point import number_names, number_steps
+from jast._src.normal_space.episode_point import number_names, number_steps, turned_in_time
 from jast._src.search.refine.modes import pointing
 from jast._src.util import checks, display
-from jast._src.util.pytrees import count_numbers
 
 if TYPE_CHECKING:
     import chex
@@ -164,9 +162,10 @@ def eigenfailures(
             f"{name}: failures must be at least {FAILURES} effective ones of the mode, received"
             f" {ess:.3g}"
         )
-    z = _align_ends(
-        sim, free_undecided(sim, z, length, numpy_generator(key)).astype(np.float64), length
-    )
+    z = free_undecided(sim, z, length, numpy_generator(key)).astype(np.float64)
+    # as late as the last of them: what was behind the end comes first
+    last = int(length.max())
+    z = turned_in_time(sim, z, last - length[:, None], last)
     mean, variances, vectors, chance = components(z, normalised(log_w), ess)
     shifts = vectors @ mean
     nats = (variances - 1 - np.log(np.maximum(variances, 1e-300)) + shifts**2) / 2
@@ -245,16 +244,6 @@ def _modes_of(sim: Simulator, z: np.ndarray, length: np.ndarray, ways: Any) -> n
     return pointing(
         sim, np.where(known, z, 0), length, transform.normal_of(sim, heads), heads.length
     )
-
-
-def _align_ends(sim: Simulator, z: np.ndarray, length: np.ndarray) -> np.ndarray:
-    """The points ``z`` [m, D] as late as the last of them: what was behind the end comes first."""
-    first, (m, d), last = count_numbers(signature_of(sim).x0), z.shape, int(length.max())
-    steps = z[:, first:].reshape(m, sim.horizon, -1)
-    at = (np.arange(last) - (last - length[:, None])) % last
-    moved = np.take_along_axis(steps[:, :last], at[..., None], axis=1)
-    late = np.concatenate([moved, steps[:, last:]], axis=1).reshape(m, d - first)
-    return np.concatenate([z[:, :first], late], axis=1)
 
 
 def _outcome(e: Episode) -> str:

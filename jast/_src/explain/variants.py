@@ -7,7 +7,6 @@ import numpy as np
 
 from jast._src.core.counter_prng import numpy_generator
 from jast._src.core.episode import Episode
-from jast._src.core.signature import signature_of
 from jast._src.core.simulator import Simulator
 from jast._src.estimate.estimate import Estimate
 from jast._src.estimate.proposal_search.mixture_draws import resample
@@ -15,10 +14,10 @@ from jast._src.estimate.redraw import is_proposal_of, redraw_failures
 from jast._src.estimate.weighted_draws import Draws
 from jast._src.explain.episodes import distinct_rows, gather_episodes, named_kinds
 from jast._src.normal_space import transform
+from jast._src.normal_space.episode_point import turned_in_time
 from jast._src.normal_space.evaluate_points import PointEvaluator
 from jast._src.normal_space.pcn import proposed
 from jast._src.search.refine.modes import Modes, owners
-from jast._src.util.pytrees import count_numbers
 
 __all__ = ["EACH", "Seeds", "Variants", "draw_variants", "find_seeds"]
 
@@ -174,7 +173,11 @@ def draw_variants(key: jax.Array, sim: Simulator, seeds: Seeds, n: int) -> Varia
     z = np.where(behind, rng.standard_normal(z.shape), z)
     near, misses = np.zeros_like(z), np.zeros(len(z), int)
     for scale in SCALES:
-        to = _shift_in_time(rng, sim, z) if scale is None else _redraw(rng, z, scale)
+        if scale is None:
+            later = rng.integers(0, sim.horizon, (len(z), 1))
+            to = turned_in_time(sim, z, later, sim.horizon)
+        else:
+            to = _redraw(rng, z, scale)
         o = evaluate(to)
         rejected = ~o.failure & ~o.invalid
         misses += rejected
@@ -210,16 +213,6 @@ def _redraw(rng: np.random.Generator, z: np.ndarray, scale: float) -> np.ndarray
     """``z`` [n, D] of which some numbers moved, of each row another share."""
     meant = rng.random(z.shape) < rng.random((len(z), 1))
     return np.where(meant, proposed(z, rng.standard_normal(z.shape), scale, 1.0), z)
-
-
-def _shift_in_time(rng: np.random.Generator, sim: Simulator, z: np.ndarray) -> np.ndarray:
-    """``z`` [n, D] with the disturbances some steps later, in a ring."""
-    n, steps = len(z), sim.horizon
-    start = count_numbers(signature_of(sim).x0)
-    at = (np.arange(steps) - rng.integers(0, steps, (n, 1))) % steps
-    rows = z[:, start:].reshape(n, steps, -1)
-    moved = np.take_along_axis(rows, at[:, :, None], axis=1)
-    return np.concatenate([z[:, :start], moved.reshape(n, -1)], axis=1)
 
 
 def _draw_seeds(rng: np.random.Generator, seeds: Seeds, kind: int, n: int) -> np.ndarray:

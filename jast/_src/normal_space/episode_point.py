@@ -21,6 +21,7 @@ __all__ = [
     "names_of_leaves",
     "number_names",
     "number_steps",
+    "turned_in_time",
 ]
 
 # by how much farther from the mode an episode is taken where it does not fail as recorded
@@ -78,6 +79,17 @@ def failing_point(
 def like_disturbances(sim: Simulator, row: np.ndarray) -> tuple[Any, Any]:
     """The numbers ``row`` [D] in the shapes of x0 and of the disturbances [horizon, ...]."""
     return jax.tree.map(lambda a: np.asarray(a).astype(row.dtype), transform.split_point(sim, row))
+
+
+def turned_in_time(sim: Simulator, z: np.ndarray, later: np.ndarray, last: int) -> np.ndarray:
+    """The points ``z`` [n, D] with the disturbances of the first ``last`` steps that many steps
+    ``later`` [n, 1], in a ring.
+    """
+    start, t = count_numbers(signature_of(sim).x0), np.arange(sim.horizon)
+    at = np.where(t < last, (t - later) % last, t)
+    steps = z[:, start:].reshape(len(z), sim.horizon, -1)
+    moved = np.take_along_axis(steps, at[:, :, None], axis=1)
+    return np.concatenate([z[:, :start], moved.reshape(len(z), -1)], axis=1)
 
 
 def number_steps(sim: Simulator) -> np.ndarray:
