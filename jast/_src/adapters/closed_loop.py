@@ -10,7 +10,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -22,19 +22,15 @@ from jast._src.adapters.noise import Random, disturbed, model_of, random, replac
 from jast._src.adapters.state_arrays import as_numbers, in_dtypes_of, with_keys
 from jast._src.core.check import OBSERVED
 from jast._src.core.simulator import Simulator, fixed, ravel
+from jast._src.core.typing import Array, DistributionLike
 from jast._src.util.pytrees import as_partial
-
-if TYPE_CHECKING:
-    import chex
-
-    from jast._src.core.typing import DistributionLike
 
 __all__ = ["Change", "Instant", "Judgement", "Noise", "Outcome", "check_environment", "simulator"]
 
 Change: TypeAlias = tuple[Any, Callable[..., Any]]
 """A distribution and what a draw of it does: (it, draw) -> it."""
 Noise: TypeAlias = "DistributionLike | Change"
-Judgement: TypeAlias = "Callable[[Instant], chex.Array]"
+Judgement: TypeAlias = "Callable[[Instant], Array]"
 
 
 class Instant(NamedTuple):
@@ -52,15 +48,15 @@ class Instant(NamedTuple):
     """The environment's own; typed keys in it as their numbers"""
     observation: Any
     """What it shows, before the noise"""
-    reward: chex.Array
+    reward: Array
     """Of the last step, the sum over agents; 0 at the start"""
-    total: chex.Array
+    total: Array
     """The sum of the rewards so far"""
-    terminated: chex.Array
+    terminated: Array
     """bool: the environment says that it has ended"""
-    time: chex.Array
+    time: Array
     """int32: steps so far"""
-    seed: chex.Array
+    seed: Array
     """uint32: of the environment's own key"""
     parameters: Any = ()
     """What was drawn for the episode"""

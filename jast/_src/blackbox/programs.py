@@ -11,14 +11,12 @@ import shutil
 import signal
 import subprocess
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from jast._src.blackbox.worker import WrongAnswer
-
-if TYPE_CHECKING:
-    from jast._src.core.typing import PathLike
+from jast._src.core.typing import PathLike
 
 __all__ = ["program"]
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 import inspect
 from collections.abc import Callable
 from functools import partial
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -21,17 +21,13 @@ from jast._src.blackbox.snapshots import BranchingRunner
 from jast._src.blackbox.worker import METHODS, Runner, Spec, takes
 from jast._src.core.check import OBSERVED
 from jast._src.core.simulator import Simulator, fixed, translating
+from jast._src.core.typing import Array, ArrayTree, DistributionLike, Disturbance, Start
 from jast._src.distributions.containers import accepted
 from jast._src.distributions.special import Seeds
 from jast._src.runtime._jax import host_call
 from jast._src.runtime.host_errors import sources
 from jast._src.util.checks import number, whole_number
 from jast._src.util.pytrees import select, shapes_text
-
-if TYPE_CHECKING:
-    import chex
-
-    from jast._src.core.typing import DistributionLike, Disturbance, Start
 
 __all__ = ["Record", "Standing", "calls", "from_python"]
 
@@ -51,12 +47,12 @@ class Record(NamedTuple):
         (1, [2.0, 0.0])
     """
 
-    begun: chex.Array
+    begun: Array
     """bool: True in every state of an episode; the system is not run on a state of zeros."""
-    t: chex.Array
+    t: Array
     """int32: disturbances so far."""
-    x0: chex.ArrayTree
-    disturbances: chex.ArrayTree
+    x0: ArrayTree
+    disturbances: ArrayTree
     """[horizon, ...]: the first t rows; zeros after them."""
 
 
@@ -83,19 +79,19 @@ class Standing(NamedTuple):
         3.0
     """
 
-    begun: chex.Array
-    t: chex.Array
-    x0: chex.ArrayTree
-    disturbances: chex.ArrayTree
-    event: chex.Array
+    begun: Array
+    t: Array
+    x0: ArrayTree
+    disturbances: ArrayTree
+    event: Array
     """bool."""
-    distance: chex.Array
+    distance: Array
     """float: miss distance; NaN where something went wrong."""
-    terminal: chex.Array
+    terminal: Array
     """bool: ended without a failure, or by an incident."""
-    log_p: chex.Array
+    log_p: Array
     """float: log p of the last disturbance as the object says it; 0 where it says nothing."""
-    seen: chex.Array
+    seen: Array
     """[k] float: what the object's ``observe`` returned; empty where it has none."""
 
 
@@ -109,8 +105,8 @@ def from_python(
     likelihood: Literal["log_prob", "prob"] | None = None,
     workers: int = 0,
     time_limit: float | None = None,
-    observe: Callable[[Any], chex.Array] | None = None,
-    like: chex.ArrayTree = None,
+    observe: Callable[[Any], Array] | None = None,
+    like: ArrayTree = None,
 ) -> Simulator:
     """A system in plain Python, NumPy or another language as a `jast.Simulator`: it is called on
     the host, once for all lanes of a batch.

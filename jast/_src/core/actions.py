@@ -6,21 +6,16 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from jast import distributions as D
+from jast._src.core.typing import Array, ArrayTree, DistributionLike, Numeric, PRNGKey
 from jast._src.distributions.normal_tails import normal_score
 from jast._src.runtime._jax import is_traced
-
-if TYPE_CHECKING:
-    import chex
-
-    from jast._src.core.typing import DistributionLike
-
 
 __all__ = [
     "Quantiles",
@@ -44,17 +39,17 @@ class _OfTheModel:
         """The distribution whose quantiles they are: the model."""
         return dist
 
-    def locate(self, x: Any, dist: DistributionLike) -> chex.ArrayTree:
+    def locate(self, x: Any, dist: DistributionLike) -> ArrayTree:
         """The point of [0, 1]^d at which ``x`` is, a pytree like ``x``: the inverse of `at`."""
         return D.cdf(self.of(dist), x)
 
-    def log_prob(self, x: Any, dist: DistributionLike) -> chex.Array:
+    def log_prob(self, x: Any, dist: DistributionLike) -> Array:
         """Log density of `draw` at ``x``."""
         return self.of(dist).log_prob(x)
 
     def near(
-        self, x: Any, dist: DistributionLike, scale: chex.Numeric, start: bool = False
-    ) -> chex.ArrayTree:
+        self, x: Any, dist: DistributionLike, scale: Numeric, start: bool = False
+    ) -> ArrayTree:
         """``x`` drawn towards the mode of the distribution, by ``scale`` in (0, 1]; integers
         stay.
         """
@@ -73,7 +68,7 @@ class Samples(_OfTheModel):
         2.0
     """
 
-    def draw(self, key: chex.PRNGKey, dist: DistributionLike) -> chex.ArrayTree:
+    def draw(self, key: PRNGKey, dist: DistributionLike) -> ArrayTree:
         """One disturbance by this choice of actions, where ``dist`` is the disturbance model at the
         state.
         """
@@ -81,7 +76,7 @@ class Samples(_OfTheModel):
 
     draw_start = draw
 
-    def at(self, u: Any, dist: DistributionLike) -> chex.ArrayTree:
+    def at(self, u: Any, dist: DistributionLike) -> ArrayTree:
         """The disturbance at the point ``u`` of [0, 1)^d; uniform points are draws of ``dist``."""
         return D.quantile(dist, u)
 
@@ -112,13 +107,13 @@ class Quantiles(_OfTheModel):
         """The distribution whose quantiles they are."""
         return dist if self.kind is None else self.kind.unflatten(self.numbers)
 
-    def draw(self, key: chex.PRNGKey, dist: DistributionLike) -> chex.ArrayTree:
+    def draw(self, key: PRNGKey, dist: DistributionLike) -> ArrayTree:
         return self.place(_like(jax.random.uniform, key, dist), dist)
 
-    def draw_start(self, key: chex.PRNGKey, dist: DistributionLike) -> chex.ArrayTree:
+    def draw_start(self, key: PRNGKey, dist: DistributionLike) -> ArrayTree:
         return D.quantile(dist, _like(jax.random.uniform, key, dist))
 
-    def place(self, u: Any, dist: DistributionLike) -> chex.ArrayTree:
+    def place(self, u: Any, dist: DistributionLike) -> ArrayTree:
         """The action at the point ``u`` in [0, 1)^d."""
         return D.quantile(self.of(dist), u)
 
@@ -143,14 +138,14 @@ class UniformBox:
     places_start = False
     focus = 0.2  # a box knows nothing of the model
 
-    def draw(self, key: chex.PRNGKey, dist: DistributionLike) -> chex.ArrayTree:
+    def draw(self, key: PRNGKey, dist: DistributionLike) -> ArrayTree:
         return self.place(_like(jax.random.uniform, key, dist), dist)
 
-    def draw_start(self, key: chex.PRNGKey, dist: DistributionLike) -> chex.ArrayTree:
+    def draw_start(self, key: PRNGKey, dist: DistributionLike) -> ArrayTree:
         """The box is one of steps: a random start is drawn from its own distribution."""
         return D.sample(dist, key)
 
-    def log_prob(self, x: Any, dist: DistributionLike) -> chex.Array:
+    def log_prob(self, x: Any, dist: DistributionLike) -> Array:
         """Log density of `draw` at ``x``: uniform, -inf outside the box."""
 
         def of(x, low, high):
@@ -163,8 +158,8 @@ class UniformBox:
         return D.sum_parts(jax.tree.map(of, x, *self.ends(x)))
 
     def near(
-        self, x: Any, dist: DistributionLike, scale: chex.Numeric, start: bool = False
-    ) -> chex.ArrayTree:
+        self, x: Any, dist: DistributionLike, scale: Numeric, start: bool = False
+    ) -> ArrayTree:
         """A box ``scale`` times as wide around the mode of ``dist``, cut to the box."""
         if start:
             return _towards_mode(x, dist, scale)
@@ -177,7 +172,7 @@ class UniformBox:
 
         return jax.tree.map(shrink, x, D.mode(dist), *self.ends(x))
 
-    def place(self, u: Any, dist: DistributionLike) -> chex.ArrayTree:
+    def place(self, u: Any, dist: DistributionLike) -> ArrayTree:
         """The point of the box at ``u`` in [0, 1)^d; integers are the whole numbers from ``low`` to
         ``high``, both included.
         """
@@ -192,7 +187,7 @@ class UniformBox:
 
     at = place
 
-    def locate(self, x: Any, dist: DistributionLike) -> chex.ArrayTree:
+    def locate(self, x: Any, dist: DistributionLike) -> ArrayTree:
         """The point of [0, 1]^d at which `place` gives ``x``, a pytree like ``x``: that of the box
         nearest to it. Integers: the middle of the cell.
         """
@@ -206,7 +201,7 @@ class UniformBox:
 
         return jax.tree.map(locate, x, *self.ends(x))
 
-    def ends(self, x: Any) -> tuple[chex.ArrayTree, chex.ArrayTree]:
+    def ends(self, x: Any) -> tuple[ArrayTree, ArrayTree]:
         """``low`` and ``high`` as pytrees like ``x``: each is one already, or an array that serves
         every one of ``x``. ValueError where it is neither.
         """
@@ -245,13 +240,13 @@ class Wide(_OfTheModel):
     def _width(self, dtype: Any) -> jax.Array:
         return jnp.asarray(1 if self.width is None else self.width, dtype)
 
-    def draw(self, key: chex.PRNGKey, dist: Any) -> Any:
+    def draw(self, key: PRNGKey, dist: Any) -> Any:
         """One disturbance by this choice of actions, where ``dist`` is the disturbance model at the
         state.
         """
         return self.of_normal(_like(jax.random.normal, key, dist), dist)
 
-    def draw_start(self, key: chex.PRNGKey, dist: Any) -> Any:
+    def draw_start(self, key: PRNGKey, dist: Any) -> Any:
         """Likewise x0; drawn from its own distribution where that has no quantile function."""
         return self.draw(key, dist) if D.has_quantile(dist) else D.sample(dist, key)
 
@@ -328,7 +323,7 @@ def quantiles(proposal: DistributionLike | None = None) -> Quantiles:
     return Quantiles(tuple(numbers), None if proposal is None else kind)
 
 
-def wide(width: chex.Numeric | None = None) -> Wide:
+def wide(width: Numeric | None = None) -> Wide:
     """Draws of the model with wider noise, which reach the tails of any distribution with a
     quantile function.
 
@@ -358,7 +353,7 @@ def wide(width: chex.Numeric | None = None) -> Wide:
     return Wide(width)
 
 
-def uniform(low: chex.ArrayTree, high: chex.ArrayTree) -> UniformBox:
+def uniform(low: ArrayTree, high: ArrayTree) -> UniformBox:
     """Disturbances uniform on a box. The ferry's published actions are ``uniform(0., 1.)``.
 
     Args:
@@ -398,7 +393,7 @@ def _as(dtype, *values):
     return (jnp.asarray(v).astype(dtype) for v in values)
 
 
-def _like(draw: Callable[..., jax.Array], key: chex.PRNGKey, dist: DistributionLike) -> Any:
+def _like(draw: Callable[..., jax.Array], key: PRNGKey, dist: DistributionLike) -> Any:
     """Numbers by ``draw`` of `jax.random` in the shape of a value of ``dist``, one independent
     stream a leaf.
     """

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -22,15 +22,11 @@ from jast._src.core.actions import Quantiles, Samples, UniformBox, Wide
 from jast._src.core.signature import signature_of
 from jast._src.core.simulator import Simulator, require_simulator
 from jast._src.core.traps import traps
+from jast._src.core.typing import Actions, Array, ArrayTree
 from jast._src.runtime._jax import is_traced, is_tracing, quick
 from jast._src.runtime.host_errors import incidents, new_incidents, runs_on_host, sources
 from jast._src.runtime.memory import release
 from jast._src.util.pytrees import select
-
-if TYPE_CHECKING:
-    import chex
-
-    from jast._src.core.typing import Actions
 
 __all__ = ["ACTIONS", "OBSERVED", "check", "contract"]
 
@@ -293,19 +289,19 @@ class _Probe(NamedTuple):
 
     has_mode: bool
     """Whether there is an undisturbed episode."""
-    density: chex.Array
+    density: Array
     """bool [L, T]: the log density of the disturbance that led there is not finite."""
-    state: chex.ArrayTree
+    state: ArrayTree
     """bool [L, T]: a leaf of the state holds NaN."""
-    distance: chex.Array
+    distance: Array
     """bool [L, T]: the miss distance is not finite."""
-    x0: chex.ArrayTree
+    x0: ArrayTree
     """Of the first episode."""
-    x: chex.ArrayTree
+    x: ArrayTree
     """Its first disturbance."""
-    judged: chex.ArrayTree
+    judged: ArrayTree
     """A state of it that is evaluated."""
-    impossible: chex.Array | None
+    impossible: Array | None
     """Share of the actions' draws at the start whose log density is not finite."""
 
 

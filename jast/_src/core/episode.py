@@ -6,7 +6,7 @@ What an episode is stands in `core.transition`; here whole ones are played and r
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -18,17 +18,12 @@ from jast._src.core.policy import Policy, nominal_policy
 from jast._src.core.signature import signature_of
 from jast._src.core.simulator import Simulator, require_simulator
 from jast._src.core.transition import advance, begin, conclude
+from jast._src.core.typing import Array, ArrayTree, PRNGKey, Reward
 from jast._src.runtime._jax import is_traced, quick
 from jast._src.runtime.host_errors import runs_on_host
 from jast._src.util import display
 from jast._src.util.checks import check_random_key
 from jast._src.util.pytrees import conform, pad_rows, select, zero_where
-
-if TYPE_CHECKING:
-    import chex
-
-    from jast._src.core.typing import Reward
-
 
 __all__ = ["Episode", "play_back", "play_chosen", "replay", "rollout"]
 
@@ -45,25 +40,25 @@ class Episode(NamedTuple):
         ((5,), (5, 30))
     """
 
-    x0: chex.ArrayTree
+    x0: ArrayTree
     """Initial disturbance, ``()`` for a system with one start."""
-    disturbances: chex.ArrayTree
+    disturbances: ArrayTree
     """[horizon, ...]: x_1 .. x_length in the first rows."""
-    log_prob: chex.Array
+    log_prob: Array
     """True log density of x0 and the ``length`` steps: never normalised."""
-    distance: chex.Array
+    distance: Array
     """Miss distance: the least, or the last one of an episodic system; inf where the simulator
     returned a number that is not finite.
     """
-    failure: chex.Array
+    failure: Array
     """bool: ended in a failure event."""
-    length: chex.Array
+    length: Array
     """int32: steps taken, 0 .. horizon."""
-    reward: chex.Array
+    reward: Array
     """Sum of the reward over the episode; -inf where the simulator returned a number that is not
     finite.
     """
-    states: chex.ArrayTree | None = None
+    states: ArrayTree | None = None
     """[horizon + 1, ...]: s_0 .. s_length in the first rows, or None where they were not kept."""
 
     def to_xarray(self) -> Any:
@@ -89,7 +84,7 @@ class Episode(NamedTuple):
 
 
 def rollout(
-    key: chex.PRNGKey,
+    key: PRNGKey,
     sim: Simulator,
     policy: Policy | None = None,
     reward: Reward = rewards.STANDARD,
@@ -146,7 +141,7 @@ def _rollout(key: jax.Array, sim: Simulator, policy: Policy | None, reward: Call
 def replay(
     sim: Simulator,
     episode: Any,
-    x0: chex.ArrayTree | None = None,
+    x0: ArrayTree | None = None,
     reward: Reward = rewards.STANDARD,
 ) -> Episode:
     """Run recorded disturbances again. Exact: the same input gives the same bits.

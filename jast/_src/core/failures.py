@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from operator import index
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import jax
 import numpy as np
@@ -19,15 +19,11 @@ import numpy as np
 from jast._src.core.episode import Episode, replay
 from jast._src.core.signature import signature_of
 from jast._src.core.simulator import Simulator
+from jast._src.core.typing import Array, PathLike, Reward
 from jast._src.io import save_load
 from jast._src.io.data_frames import dataframe
 from jast._src.io.export import by_step, from_json, to_csv, to_numpy
 from jast._src.util import display
-
-if TYPE_CHECKING:
-    import chex
-
-    from jast._src.core.typing import PathLike, Reward
 
 __all__ = [
     "Failures",
@@ -199,8 +195,8 @@ def collect(
     sim: Simulator,
     reward: Reward,
     episodes: Episode,
-    tree: chex.Array | Sequence[int] | None = None,
-    simulation: chex.Array | Sequence[int] | None = None,
+    tree: Array | Sequence[int] | None = None,
+    simulation: Array | Sequence[int] | None = None,
     seen: int | None = None,
     top: int = 64,
 ) -> Failures:

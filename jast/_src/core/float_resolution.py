@@ -8,7 +8,7 @@ at every step, and so is the probability of where it ends. The paths that show i
 from __future__ import annotations
 
 from functools import partial
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -20,12 +20,10 @@ from jast._src.core.actions import Wide
 from jast._src.core.counter_prng import COUNTER
 from jast._src.core.signature import signature_of
 from jast._src.core.simulator import Simulator
+from jast._src.core.typing import Array
 from jast._src.runtime._jax import quick
 from jast._src.runtime.host_errors import runs_on_host
 from jast._src.util.pytrees import with_strong_types
-
-if TYPE_CHECKING:
-    import chex
 
 __all__ = ["Probe", "describe", "probe", "rounding_problem"]
 
@@ -46,20 +44,20 @@ FAR_AWAY = 0.5  # likewise where it begins, at least
 class Probe(NamedTuple):
     """What paths that share their random numbers say of a system."""
 
-    units: list[chex.Array]
+    units: list[Array]
     """Of each float of the state: the median, over the starts, of the units in the last place by
     which a disturbance drawn anew moves it, where it does; else NaN."""
-    rounding: chex.Array
+    rounding: Array
     """Standard deviation of the miss distance that rounding makes."""
-    spread: chex.Array
+    spread: Array
     """That of the disturbances."""
-    unmoved: list[chex.Array]
+    unmoved: list[Array]
     """Of each leaf of the state, bool: all disturbances, drawn anew, change nothing of it."""
-    differ: chex.Array
+    differ: Array
     """bool: whether these disturbances differ."""
-    distance_differs: chex.Array
+    distance_differs: Array
     """bool: whether the miss distance does."""
-    jump: chex.Array
+    jump: Array
     """The first step at which a state jumps back to its start; 0 where none does."""
 
 

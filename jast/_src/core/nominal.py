@@ -7,7 +7,7 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -20,7 +20,9 @@ from jast._src.core.check import contract
 from jast._src.core.episode import Episode, rollout
 from jast._src.core.policy import undisturbed
 from jast._src.core.signature import signature_of
+from jast._src.core.simulator import Simulator
 from jast._src.core.transition import Progress, advance, begin, conclude
+from jast._src.core.typing import Array, Callback, Executor, PathLike, PRNGKey
 from jast._src.runtime import work
 from jast._src.runtime._jax import jit, quick
 from jast._src.runtime.backends import Task, UnitContext
@@ -31,12 +33,6 @@ from jast._src.util import display
 from jast._src.util.checks import check_random_key
 from jast._src.util.intervals import clopper_pearson
 from jast._src.util.pytrees import zero_where
-
-if TYPE_CHECKING:
-    import chex
-
-    from jast._src.core.simulator import Simulator
-    from jast._src.core.typing import Callback, Executor, PathLike
 
 __all__ = ["BRIEF", "Nominal", "nominal", "outcome"]
 
@@ -107,7 +103,7 @@ class Nominal(NamedTuple):
 
 
 def nominal(
-    key: chex.PRNGKey,
+    key: PRNGKey,
     sim: Simulator,
     episodes: int = 100_000,
     *,
@@ -203,7 +199,7 @@ def nominal(
 class Job(NamedTuple):
     """What all units of a call have in common."""
 
-    key: chex.PRNGKey
+    key: PRNGKey
     sim: Simulator
     episodes: int
     chunks: int
@@ -213,12 +209,12 @@ class Job(NamedTuple):
 class Counts(NamedTuple):
     """Of the chunks of a unit, [CHUNKS]; zeros where it has fewer."""
 
-    failures: chex.Array
-    invalid: chex.Array
-    valid: chex.Array
-    distance: chex.Array
+    failures: Array
+    invalid: Array
+    valid: Array
+    distance: Array
     """Sum over the valid ones."""
-    first: chex.Array
+    first: Array
     """Number of the first failure; that of all episodes where there is none."""
 
 
@@ -234,7 +230,7 @@ class Seen(NamedTuple):
 
 
 def _play(
-    key: chex.PRNGKey, sim: Simulator, episodes: int, watch: Watch, where: work.Placement
+    key: PRNGKey, sim: Simulator, episodes: int, watch: Watch, where: work.Placement
 ) -> work.UnitsRun:
     """`runtime.work.UnitsRun` with `Seen` of all episodes, unless interrupted."""
     chunks = -(-episodes // LANES)

@@ -23,7 +23,7 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -31,13 +31,8 @@ from jax.tree_util import Partial
 
 from jast._src.core.signature import signature_of
 from jast._src.core.simulator import Simulator
+from jast._src.core.typing import Density, Numeric, Reward
 from jast._src.runtime._jax import is_traced
-
-if TYPE_CHECKING:
-    import chex
-
-    from jast._src.core.typing import Density, Reward
-
 
 __all__ = [
     "Episodic",
@@ -196,7 +191,7 @@ class Lexicographic:
         return jnp.where(log_p == -jnp.inf, -jnp.inf, value)  # the model never does that
 
 
-def standard(event_bonus: chex.Numeric = 0.0, density: Density = "raw") -> Standard:
+def standard(event_bonus: Numeric = 0.0, density: Density = "raw") -> Standard:
     """Sum of every step's log p, plus a bonus at a failure, or less the miss distance at any other
     end.
 
@@ -217,7 +212,7 @@ def standard(event_bonus: chex.Numeric = 0.0, density: Density = "raw") -> Stand
 
 
 def episodic(
-    bonus: chex.Numeric = 100.0,
+    bonus: Numeric = 100.0,
     density: Density = "raw",
     mode: Literal["default", "thesis"] = "default",
 ) -> Episodic:
@@ -250,9 +245,7 @@ def episodic(
     return Episodic(bonus, density=_checked("episodic", density), mode=mode)
 
 
-def shaped(
-    scale: chex.Numeric, event_bonus: chex.Numeric = 0.0, density: Density = "raw"
-) -> Shaped:
+def shaped(scale: Numeric, event_bonus: Numeric = 0.0, density: Density = "raw") -> Shaped:
     """log p + scale (d(s) - d(s')) at every step, plus a bonus on arrival at a failure: eq. 21 of
     Lipkis and Agogino, paid once.
 
@@ -274,9 +267,9 @@ def shaped(
 
 
 def lexicographic(
-    near: chex.Numeric | None = None,
-    rare: chex.Numeric | None = None,
-    likely: chex.Numeric = 0.0,
+    near: Numeric | None = None,
+    rare: Numeric | None = None,
+    likely: Numeric = 0.0,
     density: Density | None = None,
 ) -> Lexicographic:
     """Any failure above all episodes that do not fail; failures by log p, the others by nearness.

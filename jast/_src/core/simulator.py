@@ -4,19 +4,17 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, fields
 from functools import update_wrapper
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jax.tree_util import Partial
 
+from jast._src.core.typing import Disturbance, Evaluate, Init, IsTerminal, Observe, Start, Step
 from jast._src.distributions.containers import accepted
 from jast._src.util import display
 from jast._src.util.pytrees import as_partial, traceable
 from jast.distributions import Fixed
-
-if TYPE_CHECKING:
-    from jast._src.core.typing import Disturbance, Evaluate, Init, IsTerminal, Observe, Start, Step
 
 __all__ = ["Simulator", "fixed", "never", "ravel", "require_simulator", "translating"]
 

@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -14,10 +14,8 @@ from jast import distributions as D
 from jast._src.core import rewards
 from jast._src.core.signature import signature_of
 from jast._src.core.simulator import Simulator
+from jast._src.core.typing import ArrayTree
 from jast._src.util.pytrees import with_strong_types
-
-if TYPE_CHECKING:
-    import chex
 
 __all__ = ["Progress", "advance", "begin", "blank", "conclude"]
 
@@ -25,7 +23,7 @@ __all__ = ["Progress", "advance", "begin", "blank", "conclude"]
 class Progress(NamedTuple):
     """An episode so far, at a state."""
 
-    state: chex.ArrayTree
+    state: ArrayTree
     log_prob: jax.Array
     reward: jax.Array
     distance: jax.Array

@@ -1,22 +1,22 @@
 """Names for what users pass to jast: the functions of a system, rewards, choices of actions,
 callbacks and executors.
 
-They are for annotations: `Step` says what ``step`` of a `jast.Simulator` takes and returns. Arrays,
-pytrees and keys are named by chex (``chex.Array``, ``chex.ArrayTree``, ``chex.PRNGKey``), which is
-only imported by type checkers.
+They are for annotations: `Step` says what ``step`` of a `jast.Simulator` takes and returns.
 """
 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any, Literal, Protocol, TypeAlias
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any, Literal, Protocol, TypeAlias
 
-if TYPE_CHECKING:
-    import chex
+import jax
+import numpy as np
 
 __all__ = [
     "Actions",
+    "Array",
+    "ArrayTree",
     "Callback",
     "Density",
     "DistributionLike",
@@ -25,8 +25,10 @@ __all__ = [
     "Executor",
     "Init",
     "IsTerminal",
+    "Numeric",
     "Objective",
     "Observe",
+    "PRNGKey",
     "PathLike",
     "Predict",
     "Reward",
@@ -34,6 +36,18 @@ __all__ = [
     "Start",
     "Step",
 ]
+
+Array: TypeAlias = jax.Array | np.ndarray | np.bool_ | np.number
+"""An array of JAX or NumPy, or one number of NumPy; no number of Python."""
+
+Numeric: TypeAlias = Array | float | int
+"""An array or a number."""
+
+ArrayTree: TypeAlias = "Array | Iterable[ArrayTree] | Mapping[Any, ArrayTree]"
+"""A pytree of arrays."""
+
+PRNGKey: TypeAlias = jax.Array
+"""A key of `jax.random`."""
 
 PathLike: TypeAlias = str | os.PathLike[str]
 """Where a file or a folder is."""
@@ -88,7 +102,7 @@ class Init(Protocol):
         [3.0, 0.0]
     """
 
-    def __call__(self, x0: Any, /) -> chex.ArrayTree: ...
+    def __call__(self, x0: Any, /) -> ArrayTree: ...
 
 
 class Step(Protocol):
@@ -103,7 +117,7 @@ class Step(Protocol):
         [3.0, 1.5]
     """
 
-    def __call__(self, state: Any, x: Any, /) -> chex.ArrayTree: ...
+    def __call__(self, state: Any, x: Any, /) -> ArrayTree: ...
 
 
 class Disturbance(Protocol):
@@ -135,7 +149,7 @@ class Evaluate(Protocol):
         [False, True]
     """
 
-    def __call__(self, state: Any, /) -> tuple[chex.Array, ...]: ...
+    def __call__(self, state: Any, /) -> tuple[Array, ...]: ...
 
 
 class Start(Protocol):
@@ -164,7 +178,7 @@ class IsTerminal(Protocol):
         True
     """
 
-    def __call__(self, state: Any, /) -> chex.Array: ...
+    def __call__(self, state: Any, /) -> Array: ...
 
 
 class Observe(Protocol):
@@ -178,7 +192,7 @@ class Observe(Protocol):
         [0.0, 1.0, 0.0]
     """
 
-    def __call__(self, state: Any, /) -> chex.Array: ...
+    def __call__(self, state: Any, /) -> Array: ...
 
 
 class Reward(Protocol):
@@ -215,15 +229,15 @@ class Actions(Protocol):
         ()
     """
 
-    def draw(self, key: chex.PRNGKey, dist: DistributionLike) -> chex.ArrayTree:
+    def draw(self, key: PRNGKey, dist: DistributionLike) -> ArrayTree:
         """One disturbance, where ``dist`` is the model of disturbances at the state."""
         ...
 
-    def draw_start(self, key: chex.PRNGKey, dist: DistributionLike) -> chex.ArrayTree:
+    def draw_start(self, key: PRNGKey, dist: DistributionLike) -> ArrayTree:
         """One initial disturbance, where ``dist`` is its model."""
         ...
 
-    def log_prob(self, x: Any, dist: DistributionLike) -> chex.Array:
+    def log_prob(self, x: Any, dist: DistributionLike) -> Array:
         """Log density of `draw` at ``x``."""
         ...
 

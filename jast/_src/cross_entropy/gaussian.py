@@ -5,7 +5,7 @@ refitted to weighted samples.
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -13,11 +13,9 @@ import numpy as np
 from jax.lax import Precision
 from jax.scipy.linalg import solve_triangular
 
+from jast._src.core.typing import Array, Numeric
 from jast._src.runtime._jax import is_traced
 from jast._src.util import display
-
-if TYPE_CHECKING:
-    import chex
 
 __all__ = [
     "Gaussian",
@@ -47,13 +45,13 @@ class Gaussian(NamedTuple):
         True
     """
 
-    mean: chex.Array
+    mean: Array
     """[d]"""
-    covariance: chex.Array
+    covariance: Array
     """[d, d]"""
 
 
-def normal(mean: chex.Array, covariance: chex.Numeric) -> Gaussian:
+def normal(mean: Array, covariance: Numeric) -> Gaussian:
     """A normal distribution of vectors, as a proposal. The dtype is that of the float arrays given,
     the wider one, else the default.
 

@@ -7,31 +7,27 @@ from __future__ import annotations
 import inspect
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any, Literal, TypeAlias
+from typing import Any, Literal, TypeAlias
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jast._src.core.typing import Array, DistributionLike, Numeric, Objective, PRNGKey, Schedule
 from jast._src.cross_entropy import iterate
+from jast._src.cross_entropy.gaussian import Gaussian
+from jast._src.cross_entropy.mixture import Mixture
 from jast._src.cross_entropy.plan import MODES, check_objective, make_plan
+from jast._src.cross_entropy.result import CEResult
 from jast._src.util.checks import check_random_key
 
-if TYPE_CHECKING:
-    import chex
-
-    from jast._src.core.typing import DistributionLike, Objective, Schedule
-    from jast._src.cross_entropy.gaussian import Gaussian
-    from jast._src.cross_entropy.mixture import Mixture
-    from jast._src.cross_entropy.result import CEResult
-
-Proposal: TypeAlias = "Gaussian | Mixture | tuple[chex.Array, chex.Numeric] | DistributionLike"
+Proposal: TypeAlias = "Gaussian | Mixture | tuple[Array, Numeric] | DistributionLike"
 
 __all__ = ["Search", "ask", "ce_method", "ce_mixture", "ce_surrogate", "finish", "start", "tell"]
 
 
 def ce_method(
-    key: chex.PRNGKey,
+    key: PRNGKey,
     objective: Objective,
     proposal: Proposal,
     *,
@@ -90,7 +86,7 @@ def ce_method(
 
 
 def ce_surrogate(
-    key: chex.PRNGKey, objective: Objective, proposal: Proposal, **settings: Any
+    key: PRNGKey, objective: Objective, proposal: Proposal, **settings: Any
 ) -> CEResult:
     """Minimise ``objective`` by the cross-entropy method with a surrogate: `CEResult`. Algorithms 2
     to 4 of R. J. Moss's thesis.
@@ -149,9 +145,7 @@ def ce_surrogate(
     return _run("ce_surrogate", key=key, objective=objective, proposal=proposal, **settings)
 
 
-def ce_mixture(
-    key: chex.PRNGKey, objective: Objective, proposal: Proposal, **settings: Any
-) -> CEResult:
+def ce_mixture(key: PRNGKey, objective: Objective, proposal: Proposal, **settings: Any) -> CEResult:
     """Minimise ``objective`` by the cross-entropy method with a surrogate and a mixture for its
     proposal: `CEResult`. Algorithm 5 of R. J. Moss's thesis.
 
@@ -184,7 +178,7 @@ def ce_mixture(
 
 
 def _run(
-    method: str, *, key: chex.PRNGKey, objective: Objective, proposal: Proposal, **settings: Any
+    method: str, *, key: PRNGKey, objective: Objective, proposal: Proposal, **settings: Any
 ) -> CEResult:
     check_random_key(method, key)
     plan, real, proposal = make_plan(method, proposal, **DEFAULTS | settings)
@@ -237,7 +231,7 @@ class Search:
 
 
 def start(
-    key: chex.PRNGKey,
+    key: PRNGKey,
     proposal: Proposal,
     method: Literal["ce_method", "ce_surrogate", "ce_mixture"] = "ce_surrogate",
     **settings: Any,
@@ -274,7 +268,7 @@ def start(
     return Search(iterate.begin(plan, key, proposal), real, plan)
 
 
-def ask(search: Search) -> np.ndarray | chex.Array:
+def ask(search: Search) -> np.ndarray | Array:
     """The next points to evaluate, [m, d]; the same until their values are told.
 
     Args:
@@ -293,7 +287,7 @@ def ask(search: Search) -> np.ndarray | chex.Array:
     return iterate.ask(search.plan, search.state)[: _count("ask", search)]
 
 
-def tell(search: Search, x: chex.Array, values: chex.Array | Sequence[float]) -> Search:
+def tell(search: Search, x: Array, values: Array | Sequence[float]) -> Search:
     """The `Search` after the objective's values at some points.
 
     Args:

@@ -4,7 +4,7 @@ maximisation (Bishop 2006, section 9.2).
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -12,13 +12,11 @@ from jax import lax
 from jax.lax import Precision
 from jax.scipy.special import logsumexp
 
+from jast._src.core.typing import Array
 from jast._src.cross_entropy import gaussian
 from jast._src.cross_entropy.gaussian import Gaussian
 from jast._src.runtime._jax import is_traced
 from jast._src.util import display
-
-if TYPE_CHECKING:
-    import chex
 
 __all__ = [
     "Mixture",
@@ -44,11 +42,11 @@ class Mixture(NamedTuple):
         (2, 1)
     """
 
-    weights: chex.Array
+    weights: Array
     """[k]"""
-    means: chex.Array
+    means: Array
     """[k, d]"""
-    covariances: chex.Array
+    covariances: Array
     """[k, d, d]"""
 
 

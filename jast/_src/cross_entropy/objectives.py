@@ -9,21 +9,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import jax.numpy as jnp
 import numpy as np
 from jax.scipy.special import logsumexp
 from jax.tree_util import Partial
 
+from jast._src.core.typing import Array, Numeric, Objective
 from jast._src.cross_entropy.gaussian import widest_float
 from jast._src.runtime._jax import is_traced
 from jast._src.util.checks import real_number
-
-if TYPE_CHECKING:
-    import chex
-
-    from jast._src.core.typing import Objective
 
 __all__ = ["ackley", "branin", "paraboloid", "sierra"]
 
@@ -35,11 +31,11 @@ _PATHS = {  # p of the source; the i-th has covariance i^decay Sigma / eta, so t
 
 
 def sierra(
-    mean: chex.Array | Sequence[float] = (0.0, 0.0),
-    variance: chex.Numeric = 3.0,
-    spacing: chex.Numeric = 2.0,
-    sharpness: chex.Numeric = 6.0,
-    decay: chex.Numeric = 1.0,
+    mean: Array | Sequence[float] = (0.0, 0.0),
+    variance: Numeric = 3.0,
+    spacing: Numeric = 2.0,
+    sharpness: Numeric = 6.0,
+    decay: Numeric = 1.0,
     order: Literal["code", "thesis"] = "code",
     log: bool = False,
 ) -> Objective:
@@ -131,7 +127,7 @@ def _log_sierra(means, variances, x):
     )
 
 
-def branin(x: chex.Array) -> chex.Array:
+def branin(x: Array) -> Array:
     """Branin's function: (x2 - 5.1 x1^2 / (4 pi^2) + 5 x1 / pi - 6)^2 + 10 (1 - 1 / (8 pi)) cos x1
     + 10.
 
@@ -155,7 +151,7 @@ def branin(x: chex.Array) -> chex.Array:
     )
 
 
-def ackley(x: chex.Array) -> chex.Array:
+def ackley(x: Array) -> Array:
     """Ackley's function: 20 - 20 exp(-0.2 sqrt(mean x_i^2)) + e - exp(mean cos(2 pi x_i)).
 
     Its least value is 0, at 0, where it is not differentiable (the gradient is given as 0). There
@@ -178,7 +174,7 @@ def ackley(x: chex.Array) -> chex.Array:
     return -20 * jnp.expm1(-0.2 * r) - math.e * jnp.expm1(-2 * jnp.mean(jnp.sin(math.pi * x) ** 2))
 
 
-def paraboloid(x: chex.Array) -> chex.Array:
+def paraboloid(x: Array) -> Array:
     """The sum of squares; 0 at 0.
 
     Args:

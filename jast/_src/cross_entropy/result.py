@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
+from jast._src.core.typing import Array
+from jast._src.cross_entropy.gaussian import Gaussian
+from jast._src.cross_entropy.mixture import Mixture
 from jast._src.util import display
-
-if TYPE_CHECKING:
-    import chex
-
-    from jast._src.cross_entropy.gaussian import Gaussian
-    from jast._src.cross_entropy.mixture import Mixture
 
 __all__ = ["CEResult", "History", "Scores", "scores"]
 
@@ -31,19 +28,19 @@ class History(NamedTuple):
         ((10,), True)
     """
 
-    x: chex.Array
+    x: Array
     """[n, d]: every point that was truly evaluated, in order"""
-    value: chex.Array
+    value: Array
     """[n]: the objective there, NaN or infinite where it was"""
-    iteration: chex.Array
+    iteration: Array
     """[n] int: from 0"""
-    best_x: chex.Array
+    best_x: Array
     """[K, d]: the best point so far, after each iteration; NaN while there is none"""
-    best_value: chex.Array
+    best_value: Array
     """[K]; inf while no value was finite"""
     proposals: Gaussian | Mixture
     """With a leading axis [K + 1]: that of each iteration, and the last"""
-    model_x: chex.Array
+    model_x: Array
     """[K, m, d]: the points that the surrogate judged in each iteration; [K, 0, d] without one"""
 
 
@@ -61,12 +58,12 @@ class CEResult(NamedTuple):
 
     proposal: Gaussian | Mixture
     """The last one"""
-    best_x: chex.Array
+    best_x: Array
     """[d]: the point of the least finite value"""
-    best_value: chex.Array
+    best_value: Array
     """That value: b_v"""
     history: History
-    invalid: chex.Array
+    invalid: Array
     """int: evaluations that gave NaN or infinity; none of them was an elite"""
 
     @property
@@ -127,20 +124,20 @@ class Scores(NamedTuple):
         True
     """
 
-    best_value: chex.Array
+    best_value: Array
     """b_v"""
-    standard_error: chex.Array
+    standard_error: Array
     """Of ``best_value``"""
-    mean_distance: chex.Array
-    rms_distance: chex.Array
+    mean_distance: Array
+    rms_distance: Array
     """Root of the mean squared distance"""
-    frobenius: chex.Array
+    frobenius: Array
     """sqrt(50) times ``rms_distance``: the size of the 2 x 50 matrix of errors of 50 runs, which
     the thesis's b_d most likely is
     """
 
 
-def scores(result: CEResult, optimum: chex.Array | None) -> Scores:
+def scores(result: CEResult, optimum: Array | None) -> Scores:
     """How good a batch of runs is after each iteration. On the host.
 
     Args:

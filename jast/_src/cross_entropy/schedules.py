@@ -10,12 +10,10 @@ from __future__ import annotations
 import math
 import operator
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
+from jast._src.core.typing import Schedule
 from jast._src.util.checks import whole_number
-
-if TYPE_CHECKING:
-    from jast._src.core.typing import Schedule
 
 __all__ = ["counts", "geometric", "manual", "uniform"]
 

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -18,19 +18,15 @@ from jast import distributions as D
 from jast._src.core import failures
 from jast._src.core.actions import Quantiles, UniformBox, quantiles
 from jast._src.core.check import contract
-from jast._src.core.episode import rollout
+from jast._src.core.episode import Episode, rollout
+from jast._src.core.failures import Failures
 from jast._src.core.rewards import LogLikelihood, as_pytree
 from jast._src.core.signature import signature_of
 from jast._src.core.simulator import Simulator
-from jast._src.cross_entropy.gaussian import normal
+from jast._src.core.typing import Actions, Objective, Reward
+from jast._src.cross_entropy.gaussian import Gaussian, normal
+from jast._src.cross_entropy.result import CEResult
 from jast._src.normal_space.sequences import latent_policy
-
-if TYPE_CHECKING:
-    from jast._src.core.episode import Episode
-    from jast._src.core.failures import Failures
-    from jast._src.core.typing import Actions, Objective, Reward
-    from jast._src.cross_entropy.gaussian import Gaussian
-    from jast._src.cross_entropy.result import CEResult
 
 __all__ = ["Stress", "over"]
 

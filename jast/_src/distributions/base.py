@@ -5,14 +5,13 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Sequence
 from math import prod
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-if TYPE_CHECKING:
-    import chex
+from jast._src.core.typing import PRNGKey
 
 __all__ = [
     "Distribution",
@@ -75,7 +74,7 @@ class Distribution(metaclass=_Kind):
         super().__init_subclass__(**settings)
         jax.tree_util.register_pytree_node(cls, _flatten, lambda static, a: _build(cls, static, a))
 
-    def _sample_n(self, key: chex.PRNGKey, n: int) -> Any:
+    def _sample_n(self, key: PRNGKey, n: int) -> Any:
         raise NotImplementedError(f"{self.name} does not define _sample_n(key, n)")
 
     def log_prob(self, value: Any) -> jax.Array:

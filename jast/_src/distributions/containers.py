@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 
+from jast._src.core.typing import Array, PRNGKey
 from jast._src.distributions.base import Distribution, is_distribution, tree_map
 from jast._src.distributions.operations import mode
 from jast._src.distributions.scipy_and_numpyro import translate
-
-if TYPE_CHECKING:
-    import chex
 
 __all__ = ["Independent", "Joint", "accepted", "leaves"]
 
@@ -72,10 +70,10 @@ class Independent(Distribution):
         batch = self._distribution.batch_shape
         return batch[: len(batch) - self._reinterpreted_batch_ndims]
 
-    def _sample_n(self, key: chex.PRNGKey, n: int) -> Any:
+    def _sample_n(self, key: PRNGKey, n: int) -> Any:
         return self._distribution.sample(seed=key, sample_shape=n)
 
-    def log_prob(self, value: Any) -> chex.Array:
+    def log_prob(self, value: Any) -> Array:
         log_p = self._distribution.log_prob(value)
         return jnp.sum(log_p, axis=tuple(-i - 1 for i in range(self._reinterpreted_batch_ndims)))
 
@@ -132,12 +130,12 @@ class Joint(Distribution):
     def dtype(self) -> Any:
         return tree_map(lambda d: d.dtype, self._distributions)
 
-    def _sample_n(self, key: chex.PRNGKey, n: int) -> Any:
+    def _sample_n(self, key: PRNGKey, n: int) -> Any:
         treedef = jax.tree.structure(self._distributions, is_leaf=is_distribution)
         keys = treedef.unflatten(list(jax.random.split(key, treedef.num_leaves)))
         return tree_map(lambda d, k: d.sample(seed=k, sample_shape=n), self._distributions, keys)
 
-    def log_prob(self, value: Any) -> chex.Array:
+    def log_prob(self, value: Any) -> Array:
         parts = tree_map(lambda d, v: d.log_prob(v), self._distributions, value)
         return jnp.sum(jnp.stack(jax.tree.leaves(parts)), axis=0)
 

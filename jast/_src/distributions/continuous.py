@@ -5,17 +5,15 @@ too, agree with its to the bit.
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jax.lax import lgamma
 
+from jast._src.core.typing import Array, ArrayTree, Numeric, PRNGKey
 from jast._src.distributions.base import Elementwise, broadcast, float_array
 from jast._src.distributions.normal import Symmetric
-
-if TYPE_CHECKING:
-    import chex
 
 __all__ = ["LOG_2", "Beta", "Gamma", "Laplace", "Logistic", "Uniform"]
 
@@ -33,10 +31,10 @@ class Laplace(Symmetric):
         1.0
     """
 
-    def _sample_n(self, key: chex.PRNGKey, n: int) -> Any:
+    def _sample_n(self, key: PRNGKey, n: int) -> Any:
         return self.loc[None] + self.scale[None] * jax.random.laplace(key, **self._like_n(n))
 
-    def log_prob(self, value: Any) -> chex.Array:
+    def log_prob(self, value: Any) -> Array:
         return -jnp.abs(self._standardize(value)) - LOG_2 - jnp.log(self._scale)
 
     def stddev(self) -> Any:
@@ -57,12 +55,12 @@ class Logistic(Symmetric):
         0.5
     """
 
-    def _sample_n(self, key: chex.PRNGKey, n: int) -> Any:
+    def _sample_n(self, key: PRNGKey, n: int) -> Any:
         tiny = jnp.finfo(self.dtype).tiny
         u = jax.random.uniform(key, **self._like_n(n), minval=tiny, maxval=1.0)
         return self._placed(jnp.log(u) - jnp.log1p(-u))
 
-    def log_prob(self, value: Any) -> chex.Array:
+    def log_prob(self, value: Any) -> Array:
         v = self._standardize(value)
         return -v - 2.0 * jax.nn.softplus(-v) - jnp.log(self._scale)
 
@@ -87,7 +85,7 @@ class Uniform(Elementwise):
     low: jax.Array = broadcast("_low")
     high: jax.Array = broadcast("_high")
 
-    def __init__(self, low: chex.ArrayTree = 0.0, high: chex.ArrayTree = 1.0) -> None:
+    def __init__(self, low: ArrayTree = 0.0, high: ArrayTree = 1.0) -> None:
         self._low, self._high = float_array(low), float_array(high)
 
     @property
@@ -98,15 +96,15 @@ class Uniform(Elementwise):
     def dtype(self) -> Any:
         return jnp.result_type(self._low, self._high)
 
-    def _sample_n(self, key: chex.PRNGKey, n: int) -> Any:
+    def _sample_n(self, key: PRNGKey, n: int) -> Any:
         u = jax.random.uniform(key, (n, *self.batch_shape), self.range.dtype)
         return self.low[None] + self.range[None] * u
 
-    def prob(self, value: Any) -> chex.Array:
+    def prob(self, value: Any) -> Array:
         outside = (value < self.low) | (value > self.high)
         return jnp.where(outside, jnp.zeros_like(value), jnp.ones_like(value) / self.range)
 
-    def log_prob(self, value: Any) -> chex.Array:
+    def log_prob(self, value: Any) -> Array:
         return jnp.log(self.prob(value))
 
     def mean(self) -> Any:
@@ -126,7 +124,7 @@ class _Pair(Elementwise):
 
     _parameters = "_a", "_b"
 
-    def __init__(self, a: chex.Numeric, b: chex.Numeric) -> None:
+    def __init__(self, a: Numeric, b: Numeric) -> None:
         self._a: jax.Array = float_array(a)
         self._b: jax.Array = float_array(b)
 
@@ -145,17 +143,17 @@ class Gamma(_Pair):
         0.5
     """
 
-    def __init__(self, concentration: chex.Numeric, rate: chex.Numeric) -> None:
+    def __init__(self, concentration: Numeric, rate: Numeric) -> None:
         super().__init__(concentration, rate)
 
     concentration: jax.Array = broadcast("_a")
     rate: jax.Array = broadcast("_b")
 
-    def _sample_n(self, key: chex.PRNGKey, n: int) -> Any:
+    def _sample_n(self, key: PRNGKey, n: int) -> Any:
         a = self.concentration
         return jax.random.gamma(key, a, (n, *a.shape), self.dtype) / self.rate[None]
 
-    def log_prob(self, value: Any) -> chex.Array:
+    def log_prob(self, value: Any) -> Array:
         a, rate = self._a, self._b
         return a * jnp.log(rate) + (a - 1) * jnp.log(value) - rate * value - lgamma(a)
 
@@ -183,18 +181,18 @@ class Beta(_Pair):
         0.5
     """
 
-    def __init__(self, alpha: chex.Numeric, beta: chex.Numeric) -> None:
+    def __init__(self, alpha: Numeric, beta: Numeric) -> None:
         super().__init__(alpha, beta)
         self._norm = lgamma(self._a) + lgamma(self._b) - lgamma(self._a + self._b)
 
     alpha: jax.Array = broadcast("_a")
     beta: jax.Array = broadcast("_b")
 
-    def _sample_n(self, key: chex.PRNGKey, n: int) -> Any:
+    def _sample_n(self, key: PRNGKey, n: int) -> Any:
         shape = (n, *self.batch_shape)
         return jax.random.beta(key, self.alpha, self.beta, shape, self.dtype)
 
-    def log_prob(self, value: Any) -> chex.Array:
+    def log_prob(self, value: Any) -> Array:
         a, b = self._a, self._b
         inner = (a - 1.0) * jnp.log(value) + (b - 1.0) * jnp.log(1.0 - value) - self._norm
         flat = ((a == 1.0) & (value == 0.0)) | ((b == 1.0) & (value == 1.0))

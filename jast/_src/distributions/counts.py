@@ -4,13 +4,14 @@ probabilities below and above, so that rare ones come at the right z in both tai
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jax.lax import lgamma
 from jax.scipy.special import betainc, gammainc, gammaincc
 
+from jast._src.core.typing import Array, Numeric, PRNGKey
 from jast._src.distributions.base import Elementwise, float_array
 from jast._src.distributions.family_table import register
 from jast._src.distributions.normal_tails import (
@@ -20,9 +21,6 @@ from jast._src.distributions.normal_tails import (
     normal_of_log_tails,
 )
 from jast._src.distributions.tilted import Tilted
-
-if TYPE_CHECKING:
-    import chex
 
 __all__ = ["Binomial", "Geometric", "Poisson", "TiltedCounts"]
 
@@ -37,7 +35,7 @@ class _Counts(Elementwise):
     def dtype(self) -> Any:
         return jnp.zeros((), int).dtype
 
-    def log_tails(self, k: int) -> tuple[chex.Array, chex.Array]:
+    def log_tails(self, k: int) -> tuple[Array, Array]:
         """(log P(X <= k), log P(X > k)) for whole k >= -1, as floats."""
         raise NotImplementedError
 
@@ -55,7 +53,7 @@ class _Counts(Elementwise):
         low, high = jax.lax.fori_loop(0, 32, halve, (jnp.full_like(top, -1), top))
         return high.astype(self.dtype)
 
-    def log_cell(self, x: Any) -> chex.Array:
+    def log_cell(self, x: Any) -> Array:
         """(log of P(X < x) + p(x) / 2, log of P(X > x) + p(x) / 2): the middle of x's cell."""
         k = jnp.floor(jnp.asarray(x).astype(self._parameter.dtype))
         half = self._log_p(jnp.maximum(k, 0)) - jnp.log(2.0).astype(k.dtype)
@@ -64,7 +62,7 @@ class _Counts(Elementwise):
         above = self.log_tails(jnp.maximum(k, -1))[1]
         return jnp.logaddexp(below, half), jnp.logaddexp(above, half)
 
-    def log_prob(self, value: Any) -> chex.Array:
+    def log_prob(self, value: Any) -> Array:
         k = jnp.asarray(value).astype(self._parameter.dtype)
         whole = (k >= 0) & (k == jnp.floor(k))
         return jnp.where(whole, self._log_p(jnp.where(whole, k, 0)), -jnp.inf)
@@ -80,11 +78,11 @@ class Geometric(_Counts):
         0
     """
 
-    def __init__(self, probs: chex.Numeric) -> None:
+    def __init__(self, probs: Numeric) -> None:
         self.probs: jax.Array = float_array(probs)
         self._parameter = self.probs
 
-    def _sample_n(self, key: chex.PRNGKey, n: int) -> Any:
+    def _sample_n(self, key: PRNGKey, n: int) -> Any:
         u = jax.random.uniform(key, (n, *self.batch_shape), self.probs.dtype)
         return self._place(None, jnp.log1p(-u))
 
@@ -95,7 +93,7 @@ class Geometric(_Counts):
     def _log_p(self, k):
         return jnp.log(self.probs) + k * jnp.log1p(-self.probs)
 
-    def log_tails(self, k: int) -> tuple[chex.Array, chex.Array]:
+    def log_tails(self, k: int) -> tuple[Array, Array]:
         above = (k + 1) * jnp.log1p(-self.probs)
         return log_one_less(above), above
 
@@ -116,7 +114,7 @@ class Poisson(_Counts):
         3
     """
 
-    def __init__(self, rate: chex.Numeric) -> None:
+    def __init__(self, rate: Numeric) -> None:
         self.rate: jax.Array = float_array(rate)
         self._parameter = self.rate
 
@@ -124,13 +122,13 @@ class Poisson(_Counts):
     def top(self) -> Any:
         return jnp.ceil(self.rate + 40 * jnp.sqrt(self.rate) + 800)  # beyond every float's z
 
-    def _sample_n(self, key: chex.PRNGKey, n: int) -> Any:
+    def _sample_n(self, key: PRNGKey, n: int) -> Any:
         return jax.random.poisson(key, self.rate, (n, *self.batch_shape), self.dtype)
 
     def _log_p(self, k):
         return k * jnp.log(self.rate) - self.rate - lgamma(k + 1)
 
-    def log_tails(self, k: int) -> tuple[chex.Array, chex.Array]:
+    def log_tails(self, k: int) -> tuple[Array, Array]:
         return jnp.log(gammaincc(k + 1, self.rate)), jnp.log(gammainc(k + 1, self.rate))
 
     def mean(self) -> Any:
@@ -152,7 +150,7 @@ class Binomial(_Counts):
 
     _parameters = "total_count", "probs"
 
-    def __init__(self, total_count: chex.Numeric, probs: chex.Numeric) -> None:
+    def __init__(self, total_count: Numeric, probs: Numeric) -> None:
         self.probs: jax.Array = float_array(probs)
         self.total_count: jax.Array = jnp.asarray(total_count, self.probs.dtype)
         self._parameter = self.probs
@@ -161,7 +159,7 @@ class Binomial(_Counts):
     def top(self) -> Any:
         return self.total_count
 
-    def _sample_n(self, key: chex.PRNGKey, n: int) -> Any:
+    def _sample_n(self, key: PRNGKey, n: int) -> Any:
         shape = (n, *self.batch_shape)
         x = jax.random.binomial(key, self.total_count, self.probs, shape, self.probs.dtype)
         return x.astype(self.dtype)
@@ -173,7 +171,7 @@ class Binomial(_Counts):
         log_p = ways + inner * jnp.log(p) + (n - inner) * jnp.log1p(-p)
         return jnp.where(k > n, -jnp.inf, log_p)
 
-    def log_tails(self, k: int) -> tuple[chex.Array, chex.Array]:
+    def log_tails(self, k: int) -> tuple[Array, Array]:
         n, p = self.total_count, self.probs
         inner = jnp.clip(k, 0, n - 1)
         below = jnp.log(betainc(n - inner, inner + 1, 1 - p))
@@ -214,7 +212,7 @@ class TiltedCounts(Tilted):
         z = normal_of_log_tails(below, above)
         return jnp.where(jnp.isinf(below), -jnp.inf, jnp.where(jnp.isinf(above), jnp.inf, z))
 
-    def log_prob(self, value: Any) -> chex.Array:
+    def log_prob(self, value: Any) -> Array:
         k = jnp.asarray(value).astype(self._mean.dtype)
         edges = (self._edge(v) for v in (jnp.maximum(k - 1, -1), k))
         a, b = ((v - self._mean) / self._deviation for v in edges)

@@ -4,15 +4,13 @@ to the bit.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 
+from jast._src.core.typing import Array, Numeric, PRNGKey
 from jast._src.distributions.base import Distribution, float_array
-
-if TYPE_CHECKING:
-    import chex
 
 __all__ = ["Bernoulli", "Categorical"]
 
@@ -53,8 +51,8 @@ class Bernoulli(_Choice):
 
     def __init__(
         self,
-        logits: chex.Numeric | None = None,
-        probs: chex.Numeric | None = None,
+        logits: Numeric | None = None,
+        probs: Numeric | None = None,
         dtype: Any = int,
     ) -> None:
         self._check(logits, probs, dtype, jnp.bool_, jnp.integer, jnp.floating)
@@ -75,11 +73,11 @@ class Bernoulli(_Choice):
             return self._logits
         return jnp.log(self._probs) - jnp.log(1 - self._probs)
 
-    def _sample_n(self, key: chex.PRNGKey, n: int) -> Any:
+    def _sample_n(self, key: PRNGKey, n: int) -> Any:
         p = self.probs
         return (jax.random.uniform(key, (n, *p.shape), p.dtype) < p[None]).astype(self._dtype)
 
-    def log_prob(self, value: Any) -> chex.Array:
+    def log_prob(self, value: Any) -> Array:
         if self._logits is None:
             log_0, log_1 = jnp.log1p(-1.0 * self._probs), jnp.log(self._probs)
         else:
@@ -110,7 +108,7 @@ class Categorical(_Choice):
     """
 
     def __init__(
-        self, logits: chex.Array | None = None, probs: chex.Array | None = None, dtype: Any = int
+        self, logits: Array | None = None, probs: Array | None = None, dtype: Any = int
     ) -> None:
         self._check(logits, probs, dtype, jnp.integer, jnp.floating)
         self._logits = self._probs = None
@@ -136,14 +134,14 @@ class Categorical(_Choice):
     def num_categories(self) -> int:
         return (self._probs if self._logits is None else self._logits).shape[-1]
 
-    def _sample_n(self, key: chex.PRNGKey, n: int) -> Any:
+    def _sample_n(self, key: PRNGKey, n: int) -> Any:
         logits, p = self.logits, self.probs
         valid = jnp.all(jnp.isfinite(p), axis=-1) & jnp.all(p >= 0, axis=-1)
         draws = jax.random.categorical(key, logits, axis=-1, shape=(n, *logits.shape[:-1]))
         draws = draws.astype(self._dtype)
         return jnp.where(valid[None], draws, jnp.ones_like(draws) * -1)
 
-    def log_prob(self, value: Any) -> chex.Array:
+    def log_prob(self, value: Any) -> Array:
         logits, k = self.logits, self.num_categories
         chosen = jax.nn.one_hot(value, k, dtype=logits.dtype)
         outside = (value < 0) | (value > k - 1)

@@ -4,16 +4,14 @@ scale. Draws and log densities agree with distrax's to the bit.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 
+from jast._src.core.typing import Array, Numeric, PRNGKey
 from jast._src.distributions.base import Distribution, Elementwise, broadcast, float_array
 from jast._src.distributions.normal_tails import HALF_LOG_2PI, ndtr
-
-if TYPE_CHECKING:
-    import chex
 
 __all__ = [
     "LocationScale",
@@ -31,7 +29,7 @@ class LocationScale(Elementwise):
     loc: jax.Array = broadcast("_loc")
     scale: jax.Array = broadcast("_scale")
 
-    def __init__(self, loc: chex.Numeric, scale: chex.Numeric) -> None:
+    def __init__(self, loc: Numeric, scale: Numeric) -> None:
         self._loc: jax.Array = float_array(loc)
         self._scale: jax.Array = float_array(scale)
 
@@ -74,10 +72,10 @@ class Normal(Symmetric):
         1.0
     """
 
-    def _sample_n(self, key: chex.PRNGKey, n: int) -> Any:
+    def _sample_n(self, key: PRNGKey, n: int) -> Any:
         return self._placed(jax.random.normal(key, **self._like_n(n)))
 
-    def log_prob(self, value: Any) -> chex.Array:
+    def log_prob(self, value: Any) -> Array:
         exponent = -0.5 * jnp.square(self._standardize(value))
         return exponent - (HALF_LOG_2PI + jnp.log(self._scale))
 
@@ -167,11 +165,11 @@ class MultivariateNormalDiag(_Vector):
     def scale_diag(self) -> jax.Array:
         return jnp.broadcast_to(self._scale_diag, self.batch_shape + self.event_shape)
 
-    def _sample_n(self, key: chex.PRNGKey, n: int) -> Any:
+    def _sample_n(self, key: PRNGKey, n: int) -> Any:
         e = self._noise.sample(seed=key, sample_shape=n)
         return self._scale_diag[None] * e + 0.0 + self._loc[None]
 
-    def log_prob(self, value: Any) -> chex.Array:
+    def log_prob(self, value: Any) -> Array:
         scale = self._scale_diag
         e = (1.0 / scale) * (value - self._loc - 0.0)
         return self._log_prob(e, 0.0 + jnp.sum(-jnp.log(jnp.abs(scale)), axis=-1))
@@ -179,7 +177,7 @@ class MultivariateNormalDiag(_Vector):
     def variance(self) -> Any:
         return jnp.square(self.scale_diag)
 
-    def covariance(self) -> chex.Array:
+    def covariance(self) -> Array:
         return jnp.vectorize(jnp.diag, signature="(k)->(k,k)")(self.variance())
 
 
@@ -221,12 +219,12 @@ class MultivariateNormalTri(_Vector):
     def is_lower(self) -> bool:
         return self._is_lower
 
-    def _sample_n(self, key: chex.PRNGKey, n: int) -> Any:
+    def _sample_n(self, key: PRNGKey, n: int) -> Any:
         product = jnp.vectorize(lambda e, a: a @ e, signature="(k),(k,k)->(k)")
         e = self._noise.sample(seed=key, sample_shape=n)
         return jax.vmap(lambda e: product(e, self._scale_tri) + self._loc)(e)
 
-    def log_prob(self, value: Any) -> chex.Array:
+    def log_prob(self, value: Any) -> Array:
         solve = jnp.vectorize(
             lambda x, a: jax.scipy.linalg.solve_triangular(a, x, lower=self._is_lower),
             signature="(k),(k,k)->(k)",
@@ -241,7 +239,7 @@ class MultivariateNormalTri(_Vector):
         square = jnp.sum(jnp.square(self._scale_tri), axis=-1)
         return jnp.broadcast_to(square, self.batch_shape + self.event_shape)
 
-    def covariance(self) -> chex.Array:
+    def covariance(self) -> Array:
         return self.scale_tri @ jnp.swapaxes(self.scale_tri, -1, -2)
 
 

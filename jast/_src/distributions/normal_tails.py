@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jax.scipy import special
 from jax.scipy.special import log_ndtr
 
-if TYPE_CHECKING:
-    import chex
+from jast._src.core.typing import Array
 
 __all__ = [
     "HALF_LOG_2PI",
@@ -102,7 +101,7 @@ def inside(u: jax.Array) -> jax.Array:
     return jnp.clip(u, eps / 2, 1 - eps)
 
 
-def fraction(x: chex.Array, low: jax.Array, high: jax.Array) -> jax.Array:
+def fraction(x: Array, low: jax.Array, high: jax.Array) -> jax.Array:
     """The part of the way from ``low`` to ``high`` at which ``x`` is, in [0, 1].
 
     Args:

@@ -6,13 +6,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jax.lax import lgamma, stop_gradient
 from jax.scipy.special import betainc, erfinv
 
+from jast._src.core.typing import Array, Numeric, PRNGKey
 from jast._src.distributions.base import Distribution, broadcast, float_array
 from jast._src.distributions.family_table import register
 from jast._src.distributions.log_tail_rows import log_tails_of
@@ -25,9 +26,6 @@ from jast._src.distributions.normal_tails import (
     normal_of_log_tails,
 )
 from jast._src.distributions.operations import from_normal
-
-if TYPE_CHECKING:
-    import chex
 
 __all__ = ["MixtureSameFamily", "StudentT", "newton", "row_of_inverse"]
 
@@ -90,9 +88,7 @@ class StudentT(Symmetric):
     _parameters = "_df", "_loc", "_scale"
     df: jax.Array = broadcast("_df")
 
-    def __init__(
-        self, df: chex.Numeric, loc: chex.Numeric = 0.0, scale: chex.Numeric = 1.0
-    ) -> None:
+    def __init__(self, df: Numeric, loc: Numeric = 0.0, scale: Numeric = 1.0) -> None:
         super().__init__(loc, scale)
         self._df = float_array(df)
 
@@ -100,11 +96,11 @@ class StudentT(Symmetric):
     def dtype(self) -> Any:
         return jnp.result_type(self._df, self._loc, self._scale)
 
-    def _sample_n(self, key: chex.PRNGKey, n: int) -> Any:
+    def _sample_n(self, key: PRNGKey, n: int) -> Any:
         shape = (n, *self.batch_shape)
         return self._placed(jax.random.t(key, self.df[None], shape, self.dtype))
 
-    def log_prob(self, value: Any) -> chex.Array:
+    def log_prob(self, value: Any) -> Array:
         return _log_t(self._df, self._standardize(value)) - jnp.log(self._scale)
 
 
@@ -188,7 +184,7 @@ class MixtureSameFamily(Distribution):
     def batch_shape(self) -> tuple[int, ...]:
         return self._components.batch_shape[:-1]
 
-    def _sample_n(self, key: chex.PRNGKey, n: int) -> Any:
+    def _sample_n(self, key: PRNGKey, n: int) -> Any:
         which, what = jax.random.split(key)
         k = self._mixture.sample(seed=which, sample_shape=n)
         k = k.reshape(n, *(1,) * (len(self.batch_shape) + 1 - k.ndim), *k.shape[1:])
@@ -196,7 +192,7 @@ class MixtureSameFamily(Distribution):
         x = self._components.sample(seed=what, sample_shape=n)
         return jnp.take_along_axis(x, k[..., None].astype(jnp.int32), axis=-1)[..., 0]
 
-    def log_prob(self, value: Any) -> chex.Array:
+    def log_prob(self, value: Any) -> Array:
         each = self._components.log_prob(jnp.asarray(value)[..., None])
         return jax.nn.logsumexp(each + _log_weights(self), axis=-1)
 

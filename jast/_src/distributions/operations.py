@@ -5,20 +5,15 @@ values, the unit interval and normal numbers. Each is a look-up in the table of 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jax import lax
 
+from jast._src.core.typing import ArrayTree, Density, DistributionLike, PRNGKey
 from jast._src.distributions.family_table import row
 from jast._src.distributions.normal_tails import float_dtype, normal_score, phi
-
-if TYPE_CHECKING:
-    import chex
-
-    from jast._src.core.typing import Density, DistributionLike
-
 
 __all__ = [
     "cdf",
@@ -39,7 +34,7 @@ __all__ = [
 ]
 
 
-def sample(d: DistributionLike, key: chex.PRNGKey) -> chex.ArrayTree:
+def sample(d: DistributionLike, key: PRNGKey) -> ArrayTree:
     """One draw from a distribution.
 
     Args:
@@ -55,7 +50,7 @@ def sample(d: DistributionLike, key: chex.PRNGKey) -> chex.ArrayTree:
     return d.sample(seed=key)
 
 
-def mode(d: DistributionLike) -> chex.ArrayTree:
+def mode(d: DistributionLike) -> ArrayTree:
     """The likeliest value of a distribution; its median where no mode is known.
 
     Args:
@@ -100,7 +95,7 @@ def log_mode(d: DistributionLike) -> jax.Array:
     return known(d) if known is not None else d.log_prob(mode(d))
 
 
-def log_density(d: DistributionLike, x: chex.ArrayTree, density: Density = "raw") -> jax.Array:
+def log_density(d: DistributionLike, x: ArrayTree, density: Density = "raw") -> jax.Array:
     """Log density of a value.
 
     Args:
@@ -119,7 +114,7 @@ def log_density(d: DistributionLike, x: chex.ArrayTree, density: Density = "raw"
     return known(d, x) if known is not None else d.log_prob(x) - log_mode(d)
 
 
-def quantile(d: DistributionLike, u: chex.ArrayTree) -> chex.ArrayTree:
+def quantile(d: DistributionLike, u: ArrayTree) -> ArrayTree:
     """The value of a distribution at a quantile, so that ``u ~ U(0, 1)`` gives a draw of it.
 
     Vectors are taken coordinate by coordinate; integers by the inverse of their distribution
@@ -144,7 +139,7 @@ def quantile(d: DistributionLike, u: chex.ArrayTree) -> chex.ArrayTree:
     return known(d, u)
 
 
-def cdf(d: DistributionLike, x: chex.ArrayTree) -> chex.ArrayTree:
+def cdf(d: DistributionLike, x: ArrayTree) -> ArrayTree:
     """The inverse of `quantile`: the ``u`` in [0, 1] with ``quantile(d, u) == x`` up to rounding.
 
     Args:
@@ -174,7 +169,7 @@ def cdf(d: DistributionLike, x: chex.ArrayTree) -> chex.ArrayTree:
     return known(d, x)
 
 
-def from_normal(d: DistributionLike, z: chex.ArrayTree) -> chex.ArrayTree:
+def from_normal(d: DistributionLike, z: ArrayTree) -> ArrayTree:
     """The value of a distribution at a normal number: ``quantile(d, Phi(z))``, so that ``z ~ N(0,
     I)`` gives a draw of ``d``.
 
@@ -197,7 +192,7 @@ def from_normal(d: DistributionLike, z: chex.ArrayTree) -> chex.ArrayTree:
     return known(d, z) if known is not None else quantile(d, jax.tree.map(phi, z))
 
 
-def to_normal(d: DistributionLike, x: chex.ArrayTree) -> chex.ArrayTree:
+def to_normal(d: DistributionLike, x: ArrayTree) -> ArrayTree:
     """The inverse of `from_normal`: z with ``from_normal(d, z) == x``; for a whole number the
     middle (in probability) of those.
 
@@ -276,7 +271,7 @@ def has_exact_tails(d: DistributionLike) -> bool:
     return known.from_normal is not None and (known.exact is None or known.exact(d))
 
 
-def event_like(d: DistributionLike) -> chex.ArrayTree:
+def event_like(d: DistributionLike) -> ArrayTree:
     """Shapes and dtypes of one value of a distribution.
 
     Args:
@@ -290,7 +285,7 @@ def event_like(d: DistributionLike) -> chex.ArrayTree:
     return jax.eval_shape(lambda: sample(d, jax.random.key(0)))
 
 
-def sum_parts(parts: chex.ArrayTree) -> jax.Array:
+def sum_parts(parts: ArrayTree) -> jax.Array:
     """The sum of a pytree of scalars, in the widest of their dtypes.
 
     Args:

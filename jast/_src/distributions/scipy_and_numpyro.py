@@ -6,11 +6,12 @@ can trace them. Neither library is imported.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 
+from jast._src.core.typing import Array, PRNGKey
 from jast._src.distributions import (
     continuous,
     counts,
@@ -22,9 +23,6 @@ from jast._src.distributions import (
 from jast._src.distributions.base import Wrapped
 from jast._src.distributions.operations import no_quantile
 from jast._src.runtime._jax import is_traced
-
-if TYPE_CHECKING:
-    import chex
 
 __all__ = ["translate"]
 
@@ -56,10 +54,10 @@ class NumPyro(Wrapped):
     def name(self) -> str:
         return type(self._distribution).__name__
 
-    def _sample_n(self, key: chex.PRNGKey, n: int) -> Any:
+    def _sample_n(self, key: PRNGKey, n: int) -> Any:
         return self._distribution.sample(key, (n,))
 
-    def log_prob(self, value: Any) -> chex.Array:
+    def log_prob(self, value: Any) -> Array:
         return self._distribution.log_prob(value)
 
     def quantile(self, u: Any) -> Any:

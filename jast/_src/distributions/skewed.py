@@ -4,11 +4,12 @@ of the probabilities below and above a value.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 
+from jast._src.core.typing import Array, ArrayTree, Numeric, PRNGKey
 from jast._src.distributions.base import Elementwise, broadcast, float_array
 from jast._src.distributions.family_table import register
 from jast._src.distributions.log_tail_rows import of_log_tails
@@ -23,9 +24,6 @@ from jast._src.distributions.normal_tails import (
     normal_of_log_tails,
 )
 
-if TYPE_CHECKING:
-    import chex
-
 __all__ = ["Exponential", "Gumbel", "LogNormal", "TruncatedNormal", "Weibull"]
 
 
@@ -39,10 +37,10 @@ class LogNormal(LocationScale):
         1.0
     """
 
-    def _sample_n(self, key: chex.PRNGKey, n: int) -> Any:
+    def _sample_n(self, key: PRNGKey, n: int) -> Any:
         return jnp.exp(self._placed(jax.random.normal(key, **self._like_n(n))))
 
-    def log_prob(self, value: Any) -> chex.Array:
+    def log_prob(self, value: Any) -> Array:
         log = jnp.log(value)
         return -0.5 * jnp.square(self._standardize(log)) - HALF_LOG_2PI - jnp.log(self._scale) - log
 
@@ -78,13 +76,13 @@ class Exponential(Elementwise):
 
     _parameters = ("rate",)
 
-    def __init__(self, rate: chex.Numeric) -> None:
+    def __init__(self, rate: Numeric) -> None:
         self.rate: jax.Array = float_array(rate)
 
-    def _sample_n(self, key: chex.PRNGKey, n: int) -> Any:
+    def _sample_n(self, key: PRNGKey, n: int) -> Any:
         return jax.random.exponential(key, (n, *self.rate.shape), self.rate.dtype) / self.rate[None]
 
-    def log_prob(self, value: Any) -> chex.Array:
+    def log_prob(self, value: Any) -> Array:
         return jnp.where(value < 0, -jnp.inf, jnp.log(self.rate) - self.rate * value)
 
     def mean(self) -> Any:
@@ -112,10 +110,10 @@ class Gumbel(LocationScale):
         1.0
     """
 
-    def _sample_n(self, key: chex.PRNGKey, n: int) -> Any:
+    def _sample_n(self, key: PRNGKey, n: int) -> Any:
         return self._placed(jax.random.gumbel(key, **self._like_n(n)))
 
-    def log_prob(self, value: Any) -> chex.Array:
+    def log_prob(self, value: Any) -> Array:
         v = self._standardize(value)
         return -(v + jnp.exp(-v)) - jnp.log(self._scale)
 
@@ -153,15 +151,15 @@ class Weibull(Elementwise):
     concentration: jax.Array = broadcast("_shape")
     scale: jax.Array = broadcast("_scale")
 
-    def __init__(self, concentration: chex.Numeric, scale: chex.Numeric) -> None:
+    def __init__(self, concentration: Numeric, scale: Numeric) -> None:
         self._shape, self._scale = float_array(concentration), float_array(scale)
 
-    def _sample_n(self, key: chex.PRNGKey, n: int) -> Any:
+    def _sample_n(self, key: PRNGKey, n: int) -> Any:
         k, scale = self.concentration, self.scale
         e = jax.random.exponential(key, (n, *k.shape), jnp.result_type(k, scale))
         return scale[None] * e ** (1 / k[None])
 
-    def log_prob(self, value: Any) -> chex.Array:
+    def log_prob(self, value: Any) -> Array:
         k, v = self._shape, value / self._scale
         inner = jnp.log(k / self._scale) + (k - 1) * jnp.log(jnp.abs(v)) - jnp.abs(v) ** k
         return jnp.where(v < 0, -jnp.inf, inner)
@@ -199,9 +197,7 @@ class TruncatedNormal(LocationScale):
     low: jax.Array = broadcast("_low")
     high: jax.Array = broadcast("_high")
 
-    def __init__(
-        self, loc: chex.Numeric, scale: chex.Numeric, low: chex.ArrayTree, high: chex.ArrayTree
-    ) -> None:
+    def __init__(self, loc: Numeric, scale: Numeric, low: ArrayTree, high: ArrayTree) -> None:
         super().__init__(loc, scale)
         self._low, self._high = float_array(low), float_array(high)
 
@@ -213,11 +209,11 @@ class TruncatedNormal(LocationScale):
         below, above = log_tails(near)[0], log_tails(far)[0]
         return a, b, below + log_one_less(jnp.minimum(above - below, 0))
 
-    def _sample_n(self, key: chex.PRNGKey, n: int) -> Any:
+    def _sample_n(self, key: PRNGKey, n: int) -> Any:
         z = jax.random.normal(key, **self._like_n(n))
         return jax.vmap(lambda z: _cut(self, z))(z)
 
-    def log_prob(self, value: Any) -> chex.Array:
+    def log_prob(self, value: Any) -> Array:
         exponent = -0.5 * jnp.square(self._standardize(value))
         log_p = exponent - HALF_LOG_2PI - jnp.log(self._scale) - self.ends()[2]
         return jnp.where((value < self._low) | (value > self._high), -jnp.inf, log_p)

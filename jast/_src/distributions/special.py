@@ -5,19 +5,15 @@ density, the tent of the MCFS-AP paper, one of two classes.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 
+from jast._src.core.typing import Array, DistributionLike, Numeric, PRNGKey
 from jast._src.distributions.base import Distribution
 from jast._src.distributions.normal_tails import fraction
 from jast._src.distributions.operations import log_density, mode
-
-if TYPE_CHECKING:
-    import chex
-
-    from jast._src.core.typing import DistributionLike
 
 __all__ = ["Deterministic", "Fixed", "Seeds", "Tent", "Where", "seeds", "tent", "where"]
 
@@ -35,14 +31,14 @@ class Fixed(Distribution):
     event_shape: Any = ()
 
     def sample(
-        self, *, seed: chex.PRNGKey | int | None = None, sample_shape: int | Sequence[int] = ()
+        self, *, seed: PRNGKey | int | None = None, sample_shape: int | Sequence[int] = ()
     ) -> Any:
         return ()
 
-    def _sample_n(self, key: chex.PRNGKey, n: int) -> Any:
+    def _sample_n(self, key: PRNGKey, n: int) -> Any:
         return ()
 
-    def log_prob(self, value: Any) -> chex.Array:
+    def log_prob(self, value: Any) -> Array:
         return jnp.zeros(())
 
     log_prob_from_mode = log_prob
@@ -71,14 +67,14 @@ class Deterministic(Distribution):
         return jax.tree.map(jnp.shape, self._value)
 
     def sample(
-        self, *, seed: chex.PRNGKey | int | None = None, sample_shape: int | Sequence[int] = ()
+        self, *, seed: PRNGKey | int | None = None, sample_shape: int | Sequence[int] = ()
     ) -> Any:
         return self._value
 
-    def _sample_n(self, key: chex.PRNGKey, n: int) -> Any:
+    def _sample_n(self, key: PRNGKey, n: int) -> Any:
         return jax.tree.map(lambda a: jnp.broadcast_to(a, (n, *a.shape)), self._value)
 
-    def log_prob(self, value: Any) -> chex.Array:
+    def log_prob(self, value: Any) -> Array:
         return jnp.zeros(())
 
     log_prob_from_mode = log_prob
@@ -105,10 +101,10 @@ class Seeds(Distribution):
     def event_shape(self) -> Any:
         return self._shape
 
-    def _sample_n(self, key: chex.PRNGKey, n: int) -> Any:
+    def _sample_n(self, key: PRNGKey, n: int) -> Any:
         return jax.random.bits(key, (n, *self._shape), jnp.uint32)
 
-    def log_prob(self, value: Any) -> chex.Array:
+    def log_prob(self, value: Any) -> Array:
         return jnp.zeros(())
 
     log_prob_from_mode = log_prob
@@ -132,10 +128,10 @@ class Tent(Distribution):
 
     def __init__(
         self,
-        center: chex.Numeric,
-        width: chex.Numeric = 1.0,
-        low: chex.Numeric = 0.0,
-        high: chex.Numeric = 1.0,
+        center: Numeric,
+        width: Numeric = 1.0,
+        low: Numeric = 0.0,
+        high: Numeric = 1.0,
     ) -> None:
         center = jnp.asarray(center)
         self._center, self._width, self._low, self._high = (
@@ -157,7 +153,7 @@ class Tent(Distribution):
         z = jnp.clip((x - self._center) / self._width, -1.0, 1.0)
         return self._width * jnp.where(z < 0, 0.5 * (1 + z) ** 2, 1 - 0.5 * (1 - z) ** 2)
 
-    def log_prob_from_mode(self, x: Any) -> chex.Array:
+    def log_prob_from_mode(self, x: Any) -> Array:
         """Log density less the log density of the mode, without the normaliser: exactly ``log(1 -
         |x - center| / width)``.
         """
@@ -165,7 +161,7 @@ class Tent(Distribution):
         height = jnp.where(inside, 1 - jnp.abs(x - self._center) / self._width, 0.0)
         return jnp.where(height > 0, jnp.log(jnp.where(height > 0, height, 1.0)), -jnp.inf)
 
-    def log_prob(self, value: Any) -> chex.Array:
+    def log_prob(self, value: Any) -> Array:
         return self.log_prob_from_mode(value) - jnp.log(self._masses()[1])
 
     def quantile(self, u: Any) -> Any:
@@ -181,7 +177,7 @@ class Tent(Distribution):
     def cdf(self, value: Any) -> Any:
         return fraction(*(self._cdf_full(v) for v in (value, self._low, self._high)))
 
-    def _sample_n(self, key: chex.PRNGKey, n: int) -> Any:
+    def _sample_n(self, key: PRNGKey, n: int) -> Any:
         return self.quantile(jax.random.uniform(key, (n, *self.batch_shape), self._center.dtype))
 
     def mode(self) -> Any:
@@ -199,7 +195,7 @@ class Where(Distribution):
         1.0
     """
 
-    def __init__(self, pred: chex.Array | bool, a: DistributionLike, b: DistributionLike) -> None:
+    def __init__(self, pred: Array | bool, a: DistributionLike, b: DistributionLike) -> None:
         self._pred, self._a, self._b = jnp.asarray(pred), a, b
 
     @property
@@ -221,19 +217,19 @@ class Where(Distribution):
             lambda x, y: jnp.where(self._pred, x, jnp.asarray(y, jnp.result_type(x))), a, b
         )
 
-    def sample(self, *, seed: chex.PRNGKey | int, sample_shape: int | Sequence[int] = ()) -> Any:
+    def sample(self, *, seed: PRNGKey | int, sample_shape: int | Sequence[int] = ()) -> Any:
         # one key serves both, as only one of the two draws is seen; the clone tells JAX's check of
         # reused keys that it is meant
         other = self._b.sample(seed=jax.random.clone(seed), sample_shape=sample_shape)
         return self.select(self._a.sample(seed=seed, sample_shape=sample_shape), other)
 
-    def _sample_n(self, key: chex.PRNGKey, n: int) -> Any:
+    def _sample_n(self, key: PRNGKey, n: int) -> Any:
         return self.sample(seed=key, sample_shape=(n,))
 
-    def log_prob(self, value: Any) -> chex.Array:
+    def log_prob(self, value: Any) -> Array:
         return self.select(self._a.log_prob(value), self._b.log_prob(value))
 
-    def log_prob_from_mode(self, value: Any) -> chex.Array:
+    def log_prob_from_mode(self, value: Any) -> Array:
         return self.select(log_density(self._a, value, "mode"), log_density(self._b, value, "mode"))
 
     def mode(self) -> Any:
@@ -241,10 +237,10 @@ class Where(Distribution):
 
 
 def tent(
-    center: chex.Numeric,
-    width: chex.Numeric = 1.0,
-    low: chex.Numeric = 0.0,
-    high: chex.Numeric = 1.0,
+    center: Numeric,
+    width: Numeric = 1.0,
+    low: Numeric = 0.0,
+    high: Numeric = 1.0,
 ) -> Tent:
     """Likeliest at a centre, falling linearly to zero on both sides, and cut to an interval.
 
@@ -282,7 +278,7 @@ def seeds(shape: Sequence[int] = ()) -> Seeds:
     return Seeds(shape)
 
 
-def where(pred: chex.Array | bool, a: DistributionLike, b: DistributionLike) -> Where:
+def where(pred: Array | bool, a: DistributionLike, b: DistributionLike) -> Where:
     """One of two distributions over values of one shape and dtype.
 
     Args:

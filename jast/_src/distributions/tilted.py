@@ -4,21 +4,16 @@ N(mean, deviation^2) in place of N(0, 1).
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 
+from jast._src.core.typing import Array, ArrayTree, DistributionLike, PRNGKey
 from jast._src.distributions.base import Wrapped
 from jast._src.distributions.family_table import row
 from jast._src.distributions.normal_tails import float_dtype
 from jast._src.distributions.operations import event_like, from_normal, has_cdf, to_normal
-
-if TYPE_CHECKING:
-    import chex
-
-    from jast._src.core.typing import DistributionLike
-
 
 __all__ = ["Tilted", "tilted", "untiltable"]
 
@@ -39,13 +34,13 @@ class Tilted(Wrapped):
         super().__init__(distribution)
         self._mean, self._deviation = mean, deviation
 
-    def _sample_n(self, key: chex.PRNGKey, n: int) -> Any:
+    def _sample_n(self, key: PRNGKey, n: int) -> Any:
         z = self._mean[None] + self._deviation[None] * jax.random.normal(
             key, (n, *self._mean.shape), self._mean.dtype
         )
         return jax.vmap(lambda z: from_normal(self._distribution, z))(z)
 
-    def log_prob(self, value: Any) -> chex.Array:
+    def log_prob(self, value: Any) -> Array:
         """log p(x) + log N(z; mean, deviation) - log N(z; 0, 1) at z = Phi^-1(cdf(x)), as dz/dx is
         the same in both.
         """
@@ -56,9 +51,7 @@ class Tilted(Wrapped):
         return log_p + jnp.sum(gain, axis=tuple(range(log_p.ndim, gain.ndim)))
 
 
-def tilted(
-    dist: DistributionLike, mean: chex.ArrayTree, deviation: chex.ArrayTree
-) -> DistributionLike:
+def tilted(dist: DistributionLike, mean: ArrayTree, deviation: ArrayTree) -> DistributionLike:
     """The distribution of x = Q(Phi(z)), z ~ N(mean, deviation^2), Q the quantile function of a
     distribution.
 

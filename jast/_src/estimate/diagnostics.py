@@ -5,12 +5,10 @@ greatest weights, and the rules made of them.
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-if TYPE_CHECKING:
-    import chex
+from jast._src.core.typing import Array
 
 __all__ = [
     "MIN_ESS",
@@ -40,7 +38,7 @@ MIN_TAIL = 5
 """Weights that a shape is fitted to, at least."""
 
 
-def pareto_k(log_weights: chex.Array, samples: int, failures: int | None = None) -> float:
+def pareto_k(log_weights: Array, samples: int, failures: int | None = None) -> float:
     """Shape k of the generalised Pareto distribution of the greatest weights.
 
     Below 0.5 the weights look as if they had a variance, above 0.7 no standard error can be trusted
@@ -142,7 +140,7 @@ def weight_warnings(failures: int, ess: float, k_hat: float, max_share: float) -
     return found
 
 
-def warnings_of_weights(log_weights: chex.Array, samples: int, ess: float) -> list[str]:
+def warnings_of_weights(log_weights: Array, samples: int, ess: float) -> list[str]:
     """`weight_warnings` of these weights [m] above 0, of ``samples`` in all, whose effective sample
     size is known.
     """

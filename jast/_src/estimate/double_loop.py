@@ -5,29 +5,22 @@ traces.
 from __future__ import annotations
 
 from functools import partial
-from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
 from jax.scipy.special import logsumexp
 
 from jast._src.core.check import contract
-from jast._src.estimate.estimate import estimate_from_weights
+from jast._src.core.policy import Policy
+from jast._src.core.simulator import Simulator
+from jast._src.core.typing import Callback, PRNGKey
+from jast._src.estimate.estimate import Estimate, estimate_from_weights
 from jast._src.estimate.importance_sampling import Traces, chunks, one_trace
-from jast._src.estimate.proposals import as_proposal
+from jast._src.estimate.proposals import Proposal, as_proposal
 from jast._src.runtime.progress_bar import Watch
 from jast._src.util.checks import check_random_key, whole_number
 from jast._src.util.display import call_settings
 from jast._src.util.intervals import checked_level
-
-if TYPE_CHECKING:
-    import chex
-
-    from jast._src.core.policy import Policy
-    from jast._src.core.simulator import Simulator
-    from jast._src.core.typing import Callback
-    from jast._src.estimate.estimate import Estimate
-    from jast._src.estimate.proposals import Proposal
 
 __all__ = ["double_loop"]
 
@@ -36,7 +29,7 @@ MAX_LANES = 16384
 
 
 def double_loop(
-    key: chex.PRNGKey,
+    key: PRNGKey,
     sim: Simulator,
     proposal: Proposal | Policy,
     starts: int = 1000,

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from functools import partial
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -18,11 +18,15 @@ from jax import lax
 from jast import distributions as D
 from jast._src.core import rewards
 from jast._src.core.episode import play_back
+from jast._src.core.policy import Policy
+from jast._src.core.simulator import Simulator
+from jast._src.core.typing import PRNGKey
 from jast._src.estimate import diagnostics
+from jast._src.estimate.estimate import Estimate
 from jast._src.estimate.exceedance_and_times import draws_and_level
 from jast._src.estimate.importance_sampling import choose_component
 from jast._src.estimate.monte_carlo import episode_keys
-from jast._src.estimate.proposals import as_proposal
+from jast._src.estimate.proposals import Proposal, as_proposal
 from jast._src.estimate.redraw import dimension_of, redraw_chunk
 from jast._src.estimate.weighted_draws import (
     mean_interval,
@@ -36,14 +40,6 @@ from jast._src.util import display
 from jast._src.util.checks import check_random_key, whole_number
 from jast._src.util.intervals import clopper_pearson, log_normal
 from jast._src.util.pytrees import as_partial, select, with_strong_types, zero_where
-
-if TYPE_CHECKING:
-    import chex
-
-    from jast._src.core.policy import Policy
-    from jast._src.core.simulator import Simulator
-    from jast._src.estimate.estimate import Estimate
-    from jast._src.estimate.proposals import Proposal
 
 __all__ = ["Event", "GivenStart", "events", "given_start"]
 
@@ -165,7 +161,7 @@ def events(
 
 
 def given_start(
-    key: chex.PRNGKey,
+    key: PRNGKey,
     sim: Simulator,
     estimate: Estimate,
     named: Mapping[str, Callable[[Any], Any]],

@@ -7,10 +7,11 @@ from __future__ import annotations
 import math
 from bisect import bisect_left
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from jast._src.core.typing import Array
 from jast._src.estimate import diagnostics
 from jast._src.estimate.estimate import Estimate
 from jast._src.estimate.weighted_draws import (
@@ -25,9 +26,6 @@ from jast._src.estimate.weighted_draws import (
 from jast._src.util import display
 from jast._src.util.checks import number
 from jast._src.util.intervals import checked_level
-
-if TYPE_CHECKING:
-    import chex
 
 __all__ = [
     "Exceedance",
@@ -110,7 +108,7 @@ class FailureTimes(NamedTuple):
 
 def exceedance(
     estimate: Estimate,
-    thresholds: Sequence[float] | chex.Array | None = None,
+    thresholds: Sequence[float] | Array | None = None,
     *,
     level: float | None = None,
 ) -> Exceedance:

@@ -6,10 +6,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import partial
-from typing import TYPE_CHECKING
 
 import jax
 
+from jast._src.core.failures import Failures
+from jast._src.core.simulator import Simulator
+from jast._src.core.typing import Callback, Executor, PathLike, PRNGKey
 from jast._src.estimate import budgets
 from jast._src.estimate.estimate import Estimate, flag_imprecise
 from jast._src.estimate.few_calls import few_calls
@@ -29,13 +31,6 @@ from jast._src.util.checks import check_random_key, whole_number
 from jast._src.util.display import call_settings
 from jast._src.util.intervals import checked_level
 
-if TYPE_CHECKING:
-    import chex
-
-    from jast._src.core.failures import Failures
-    from jast._src.core.simulator import Simulator
-    from jast._src.core.typing import Callback, Executor, PathLike
-
 __all__ = [
     "MAX_SURROGATE_NUMBERS",
     "MIN_BUDGET",
@@ -52,7 +47,7 @@ LEVELS = 20
 
 
 def failure_probability(
-    key: chex.PRNGKey,
+    key: PRNGKey,
     sim: Simulator,
     budget: int | None = None,
     *,
@@ -240,7 +235,7 @@ def failure_probability(
 
 
 def adaptive_cross_entropy(
-    key: chex.PRNGKey, sim: Simulator, budget: int = 100_000, *, level: float = 0.95
+    key: PRNGKey, sim: Simulator, budget: int = 100_000, *, level: float = 0.95
 ) -> Estimate:
     """The multi-level cross-entropy method (de Boer, Kroese, Mannor and Rubinstein 2005) with one
     Gaussian, then importance sampling with the rest of the budget.

@@ -5,19 +5,22 @@ a user looks at.
 from __future__ import annotations
 
 from functools import partial
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 
 from jast._src.core.episode import Episode
+from jast._src.core.policy import Policy
+from jast._src.core.simulator import Simulator
+from jast._src.core.typing import PathLike, PRNGKey
 from jast._src.estimate.estimate import Estimate
 from jast._src.estimate.gaussians.mixture_fit import effective_sample_size
 from jast._src.estimate.host_populations import equilibrate
 from jast._src.estimate.importance_sampling import draw_episodes
 from jast._src.estimate.population.failure_sample import Sample
 from jast._src.estimate.proposal_search.mixture_draws import resample
-from jast._src.estimate.proposals import as_proposal
+from jast._src.estimate.proposals import Proposal, as_proposal
 from jast._src.estimate.redraw import dimension_of, redraw
 from jast._src.estimate.tilts.tilts import Tilts, shape
 from jast._src.io.data_frames import dataset
@@ -26,14 +29,6 @@ from jast._src.runtime.checkpoints import answer_once, keep_answers, open_checkp
 from jast._src.runtime.memory import require_episodes
 from jast._src.util import display
 from jast._src.util.checks import check_random_key, whole_number
-
-if TYPE_CHECKING:
-    import chex
-
-    from jast._src.core.policy import Policy
-    from jast._src.core.simulator import Simulator
-    from jast._src.core.typing import PathLike
-    from jast._src.estimate.proposals import Proposal
 
 __all__ = ["FailureSamples", "failure_samples"]
 
@@ -89,7 +84,7 @@ class FailureSamples(NamedTuple):
 
 
 def failure_samples(
-    key: chex.PRNGKey,
+    key: PRNGKey,
     sim: Simulator,
     source: Estimate | Proposal | Policy,
     samples: int = 1000,

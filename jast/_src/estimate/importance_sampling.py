@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import partial
-from typing import TYPE_CHECKING, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -21,13 +21,15 @@ from jax.scipy.special import logsumexp
 from jast import distributions as D
 from jast._src.core.check import contract
 from jast._src.core.episode import rollout
-from jast._src.core.policy import nominal_policy
+from jast._src.core.policy import Policy, nominal_policy
 from jast._src.core.rewards import log_likelihood
 from jast._src.core.signature import signature_of
+from jast._src.core.simulator import Simulator
 from jast._src.core.transition import advance, begin, conclude
+from jast._src.core.typing import Array, Callback, Executor, PathLike, PRNGKey
 from jast._src.estimate import weight_sums
-from jast._src.estimate.estimate import estimate_from_weights
-from jast._src.estimate.proposals import as_proposal
+from jast._src.estimate.estimate import Estimate, estimate_from_weights
+from jast._src.estimate.proposals import Proposal, as_proposal
 from jast._src.estimate.weighted_draws import with_source
 from jast._src.runtime import work
 from jast._src.runtime._jax import jit
@@ -39,15 +41,6 @@ from jast._src.util import display
 from jast._src.util.checks import check_random_key, whole_number
 from jast._src.util.display import call_settings
 from jast._src.util.intervals import checked_level
-
-if TYPE_CHECKING:
-    import chex
-
-    from jast._src.core.policy import Policy
-    from jast._src.core.simulator import Simulator
-    from jast._src.core.typing import Callback, Executor, PathLike
-    from jast._src.estimate.estimate import Estimate
-    from jast._src.estimate.proposals import Proposal
 
 __all__ = [
     "Traces",
@@ -77,22 +70,22 @@ class Traces(NamedTuple):
         ((100,), True)
     """
 
-    log_weight: chex.Array
+    log_weight: Array
     """log p - log q to the end of the episode, also of those that do not fail"""
-    shares: chex.Array
+    shares: Array
     """[n, K] log of the probability that component k made the trace"""
-    failure: chex.Array
+    failure: Array
     """bool"""
-    invalid: chex.Array
+    invalid: Array
     """bool: the simulator or a density returned NaN; no failure then"""
-    length: chex.Array
+    length: Array
     """int32: steps taken"""
-    distance: chex.Array | None = None
+    distance: Array | None = None
     """Miss distance; inf where invalid"""
 
 
 def log_weights(
-    key: chex.PRNGKey,
+    key: PRNGKey,
     sim: Simulator,
     proposal: Proposal | Policy,
     samples: int,
@@ -141,7 +134,7 @@ def _goes_to_horizon(function, mode):
 
 
 def importance(
-    key: chex.PRNGKey,
+    key: PRNGKey,
     sim: Simulator,
     proposal: Proposal | Policy,
     samples: int = 100_000,

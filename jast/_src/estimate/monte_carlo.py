@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -15,6 +15,8 @@ from jast._src.core.check import contract
 from jast._src.core.nominal import outcome
 from jast._src.core.rewards import log_likelihood
 from jast._src.core.signature import signature_of
+from jast._src.core.simulator import Simulator
+from jast._src.core.typing import Callback, Executor, PathLike, PRNGKey
 from jast._src.estimate.estimate import Estimate, estimate_from_counts
 from jast._src.estimate.importance_sampling import Traces, chunks
 from jast._src.estimate.proposal_search.mixture_draws import plain_chunk, rows_of
@@ -29,12 +31,6 @@ from jast._src.util.checks import check_random_key, whole_number
 from jast._src.util.display import call_settings
 from jast._src.util.intervals import checked_level
 
-if TYPE_CHECKING:
-    import chex
-
-    from jast._src.core.simulator import Simulator
-    from jast._src.core.typing import Callback, Executor, PathLike
-
 __all__ = ["episode_keys", "lanes_of_points", "monte_carlo", "simulate_points"]
 
 CHUNK_EPISODES = 16384
@@ -44,7 +40,7 @@ BLOCK_EPISODES = 128
 
 
 def monte_carlo(
-    key: chex.PRNGKey,
+    key: PRNGKey,
     sim: Simulator,
     samples: int = 100_000,
     *,

@@ -7,7 +7,7 @@ De Boer, Kroese, Mannor and Rubinstein 2005, A tutorial on the cross-entropy met
 from __future__ import annotations
 
 from functools import partial
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -22,14 +22,12 @@ from jast._src.core.episode import rollout
 from jast._src.core.policy import Policy
 from jast._src.core.signature import ask, signature_of
 from jast._src.core.simulator import Simulator
+from jast._src.core.typing import Array, PRNGKey
 from jast._src.normal_space import sequences
 from jast._src.runtime._jax import jit
 from jast._src.runtime.memory import require_episodes
 from jast._src.util import display
 from jast._src.util.checks import check_random_key, real_number, whole_number
-
-if TYPE_CHECKING:
-    import chex
 
 __all__ = ["FailureProposal", "failure_proposal"]
 
@@ -58,19 +56,19 @@ class FailureProposal(NamedTuple):
     """`Steps` [1, ...] of the latent of x0, ``()`` where x0 is not tilted"""
     steps: sequences.Steps
     """`Steps` [horizon, ...] of the latents of x_1 .. x_T"""
-    levels: chex.Array
+    levels: Array
     """[K]: the miss distance gamma_k that the elites of an iteration reached, 0 where they failed;
     inf where no episode counted
     """
-    failing: chex.Array
+    failing: Array
     """[K] int32: failing episodes of an iteration"""
-    ess: chex.Array
+    ess: Array
     """[K]: effective number of the elites, (sum w)^2 / sum w^2"""
-    episodes: chex.Array
+    episodes: Array
     """int: episodes simulated in all; ``evaluations`` is another name"""
-    invalid: chex.Array
+    invalid: Array
     """int: those in which the simulator returned a number that is not finite"""
-    reached: chex.Array
+    reached: Array
     """bool: whether all of the last elites fail, and are worth two effective episodes or more;
     otherwise the proposal is fitted to near misses too
     """
@@ -103,13 +101,13 @@ class FailureProposal(NamedTuple):
 class Settings(NamedTuple):
     """The traced part."""
 
-    quantile: chex.Array
-    smoothing: chex.Array
-    floor: chex.Array
+    quantile: Array
+    smoothing: Array
+    floor: Array
 
 
 def failure_proposal(
-    key: chex.PRNGKey,
+    key: PRNGKey,
     sim: Simulator,
     *,
     samples: int = 1000,

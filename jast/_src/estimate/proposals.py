@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -21,17 +21,14 @@ from jast._src.core.check import contract
 from jast._src.core.episode import Episode
 from jast._src.core.policy import Policy
 from jast._src.core.signature import ask, signature_of
+from jast._src.core.simulator import Simulator
+from jast._src.core.typing import Array
 from jast._src.distributions.mixtures import blend
 from jast._src.normal_space.transform import latents
 from jast._src.runtime._jax import is_traced
 from jast._src.util import display
 from jast._src.util.checks import real_number
 from jast._src.util.pytrees import conform
-
-if TYPE_CHECKING:
-    import chex
-
-    from jast._src.core.simulator import Simulator
 
 __all__ = ["Proposal", "as_proposal", "policy_proposal", "trace_proposal"]
 
@@ -54,7 +51,7 @@ class Proposal:
         True
     """
 
-    log_weights: chex.Array
+    log_weights: Array
     """[K], of sum 1 as probabilities"""
     policies: Policy
     """Stacked: a leading axis [K] on every leaf"""

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import jax
 import numpy as np
 
 from jast._src.core.simulator import Simulator
+from jast._src.core.typing import Callback, Executor, PathLike, PRNGKey
 from jast._src.estimate.estimate import Estimate, estimate_from_mean
 from jast._src.estimate.host_populations import FINAL_MOVES, LEVEL_SHARE, Explored, explore
 from jast._src.estimate.replicates import LOST_MODE_REMARK, MIN_REPLICATES, mean_of_replicates
@@ -23,11 +23,6 @@ from jast._src.util.checks import check_random_key, whole_number
 from jast._src.util.display import call_settings
 from jast._src.util.intervals import checked_level
 
-if TYPE_CHECKING:
-    import chex
-
-    from jast._src.core.typing import Callback, Executor, PathLike
-
 __all__ = ["fallback_estimate", "subset_simulation"]
 
 MIN_SAMPLES = 100
@@ -39,7 +34,7 @@ MIN_LOG_PROBABILITY = -690.0
 
 
 def subset_simulation(
-    key: chex.PRNGKey,
+    key: PRNGKey,
     sim: Simulator,
     samples: int = 1000,
     *,

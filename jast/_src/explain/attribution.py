@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -12,6 +12,7 @@ import numpy as np
 from jast._src.core.counter_prng import numpy_generator
 from jast._src.core.episode import Episode
 from jast._src.core.simulator import Simulator
+from jast._src.core.typing import PRNGKey
 from jast._src.normal_space.design_point_descent import differentiable
 from jast._src.normal_space.episode_point import (
     EpisodePoint,
@@ -22,10 +23,6 @@ from jast._src.normal_space.episode_point import (
 )
 from jast._src.runtime.host_errors import runs_on_host
 from jast._src.util import checks, display
-
-if TYPE_CHECKING:
-    import chex
-
 
 __all__ = ["Attribution", "attribution"]
 
@@ -83,7 +80,7 @@ def attribution(
     episode: Episode,
     method: Literal["shapley", "integrated", "gradient"] = "shapley",
     *,
-    key: chex.PRNGKey | None = None,
+    key: PRNGKey | None = None,
     permutations: int = 200,
     budget: int | None = None,
 ) -> Attribution:

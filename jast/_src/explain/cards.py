@@ -3,23 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import jax
 
 from jast._src.core.simulator import Simulator
+from jast._src.core.typing import PRNGKey
 from jast._src.estimate.tilts.tilts import Tilts
 from jast._src.explain.criticality import Criticality, criticality
 from jast._src.explain.eigenfailures import Eigenfailures, eigenfailures
 from jast._src.explain.minimal import MIN_HOSTED_BUDGET, Minimal, minimal
 from jast._src.runtime.host_errors import runs_on_host
 from jast._src.search.refine.modes import Mode
+from jast._src.stress_testing.report import Report
 from jast._src.util import checks
-
-if TYPE_CHECKING:
-    import chex
-
-    from jast._src.stress_testing.report import Report
 
 __all__ = ["cards"]
 
@@ -28,7 +25,7 @@ CONTINUATIONS = 20  # of a state, below which nothing is told
 
 
 def cards(
-    key: chex.PRNGKey, sim: Simulator, modes: Sequence[Mode] | Report, budget: int = 20_000
+    key: PRNGKey, sim: Simulator, modes: Sequence[Mode] | Report, budget: int = 20_000
 ) -> list[list[Minimal | Criticality | Eigenfailures]]:
     """`minimal` and `criticality` of the likeliest failure of each of the first four ``modes``; of
     those of a report also `eigenfailures`, where its estimate drew enough failures, and a black box

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -12,13 +12,11 @@ from jast import distributions as D
 from jast._src.core.episode import Episode, play_chosen, replay
 from jast._src.core.rewards import log_likelihood
 from jast._src.core.simulator import Simulator, require_simulator
+from jast._src.core.typing import PRNGKey
 from jast._src.runtime.host_errors import runs_on_host
 from jast._src.util import checks, display
 from jast._src.util.intervals import checked_level, clopper_pearson
 from jast._src.util.pytrees import map_in_lanes, select
-
-if TYPE_CHECKING:
-    import chex
 
 __all__ = ["Criticality", "criticality"]
 
@@ -81,7 +79,7 @@ class Criticality(NamedTuple):
 
 
 def criticality(
-    key: chex.PRNGKey,
+    key: PRNGKey,
     sim: Simulator,
     episode: Episode,
     *,

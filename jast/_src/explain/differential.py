@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -11,11 +11,9 @@ from jax.tree_util import Partial
 from jast import distributions as D
 from jast._src.core.signature import signature_of
 from jast._src.core.simulator import Simulator
+from jast._src.core.typing import Array, PRNGKey
 from jast._src.stress_testing.report import Report
 from jast._src.util.pytrees import select, with_strong_types
-
-if TYPE_CHECKING:
-    import chex
 
 __all__ = ["differential", "regression"]
 
@@ -24,8 +22,8 @@ class Side(NamedTuple):
     """One of two systems."""
 
     state: Any
-    failed: chex.Array
-    over: chex.Array
+    failed: Array
+    over: Array
 
 
 class Both(NamedTuple):
@@ -33,14 +31,14 @@ class Both(NamedTuple):
 
     a: Side
     b: Side
-    nearest: chex.Array
+    nearest: Array
     """Miss distance of b so far"""
-    t: chex.Array
+    t: Array
     """int32: steps"""
 
 
 def differential(
-    key: chex.PRNGKey, sim_a: Simulator, sim_b: Simulator, budget: int = 200_000, **settings: Any
+    key: PRNGKey, sim_a: Simulator, sim_b: Simulator, budget: int = 200_000, **settings: Any
 ) -> Report:
     """Which disturbances make version b fail, and not version a; and how probable is that?
 

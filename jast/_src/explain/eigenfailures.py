@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -11,6 +11,7 @@ import numpy as np
 from jast._src.core.counter_prng import numpy_generator
 from jast._src.core.episode import Episode
 from jast._src.core.simulator import Simulator
+from jast._src.core.typing import PRNGKey
 from jast._src.estimate.estimate import Estimate
 from jast._src.estimate.gaussians.mixture_fit import effective_sample_size
 from jast._src.explain.episodes import gather_episodes
@@ -19,9 +20,6 @@ from jast._src.normal_space import transform
 from jast._src.normal_space.episode_point import number_names, number_steps, turned_in_time
 from jast._src.search.refine.modes import pointing
 from jast._src.util import checks, display
-
-if TYPE_CHECKING:
-    import chex
 
 __all__ = ["Eigenfailures", "eigenfailures"]
 
@@ -102,7 +100,7 @@ class Eigenfailures(NamedTuple):
 
 
 def eigenfailures(
-    key: chex.PRNGKey, sim: Simulator, failures: Any, mode: int = 0, *, directions: int = 3
+    key: PRNGKey, sim: Simulator, failures: Any, mode: int = 0, *, directions: int = 3
 ) -> Eigenfailures:
     """In which few directions do the failures of a mode differ from the model?
 

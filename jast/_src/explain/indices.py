@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 from statistics import NormalDist
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from jast._src.core.counter_prng import numpy_generator
 from jast._src.core.simulator import Simulator
+from jast._src.core.typing import PRNGKey
 from jast._src.estimate.estimate import Estimate
 from jast._src.estimate.exceedance_and_times import draws_and_level
 from jast._src.estimate.gaussians.mixture_fit import effective_sample_size
@@ -20,9 +21,6 @@ from jast._src.normal_space.episode_point import number_names, number_steps
 from jast._src.normal_space.evaluate_points import PointEvaluator
 from jast._src.util import checks, display
 from jast._src.util.intervals import clopper_pearson, log_normal
-
-if TYPE_CHECKING:
-    import chex
 
 __all__ = ["Index", "Indices", "indices"]
 
@@ -103,7 +101,7 @@ class Indices(NamedTuple):
 
 
 def indices(
-    key: chex.PRNGKey,
+    key: PRNGKey,
     sim: Simulator,
     estimate: Estimate,
     *,

@@ -3,23 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import jax
 import numpy as np
 
 from jast._src.core.counter_prng import numpy_generator
 from jast._src.core.simulator import Simulator
+from jast._src.core.typing import PRNGKey
 from jast._src.explain.episodes import draw_ordinary, observations
 from jast._src.explain.held_out import hold_out, sklearn_module
 from jast._src.explain.training_cases import given_cases, simulate_cases
 from jast._src.util import checks, display
 from jast._src.util.intervals import clopper_pearson
 from jast._src.weakness.measures import Roc, roc
-
-if TYPE_CHECKING:
-    import chex
-
 
 __all__ = ["Monitor", "monitor"]
 
@@ -128,7 +125,7 @@ def monitor(
     observe: Callable[[Any], Any] | None = None,
     model: Literal["boosted", "logistic"] = "boosted",
     false_alarms: float = 0.01,
-    key: chex.PRNGKey | None = None,
+    key: PRNGKey | None = None,
     episodes: int = 1000,
     level: float = 0.95,
     budget: int | None = None,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import jax
 import numpy as np
@@ -11,16 +11,13 @@ import numpy as np
 from jast._src.core.counter_prng import numpy_generator
 from jast._src.core.episode import Episode
 from jast._src.core.simulator import Simulator
+from jast._src.core.typing import PRNGKey
 from jast._src.explain.decision_tree import grow_tree, read_rules
 from jast._src.explain.episodes import gather_episodes, play_to_horizon
 from jast._src.explain.feature_table import Describer, feature_table, make_describer
 from jast._src.explain.held_out import DISTINCT, hold_out, sklearn_module
 from jast._src.explain.training_cases import given_cases, simulate_cases
 from jast._src.util import checks, display
-
-if TYPE_CHECKING:
-    import chex
-
 
 __all__ = ["Rules", "rules"]
 
@@ -106,7 +103,7 @@ def rules(
     others: Any = None,
     *,
     labels: Sequence[Any] | None = None,
-    key: chex.PRNGKey | None = None,
+    key: PRNGKey | None = None,
     episodes: int = 1000,
     of: Literal["disturbances", "states", "both"] = "disturbances",
     lead: int = 5,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from statistics import NormalDist
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -12,6 +12,7 @@ import numpy as np
 
 from jast._src.core.episode import replay
 from jast._src.core.simulator import Simulator
+from jast._src.core.typing import PRNGKey
 from jast._src.estimate.estimate import Estimate
 from jast._src.estimate.gaussians.mixture_fit import effective_sample_size
 from jast._src.estimate.population.failure_sample import Sample
@@ -20,9 +21,6 @@ from jast._src.explain.estimate_draws import UNRELIABLE, normalised
 from jast._src.normal_space import transform
 from jast._src.util import checks, display
 from jast._src.util.intervals import checked_level
-
-if TYPE_CHECKING:
-    import chex
 
 __all__ = ["Sensitivity", "sensitivity"]
 
@@ -71,7 +69,7 @@ def sensitivity(
     sim: Simulator,
     estimate: Estimate,
     *,
-    key: chex.PRNGKey | None = None,
+    key: PRNGKey | None = None,
     samples: int = 16_384,
     level: float = 0.95,
 ) -> Sensitivity:

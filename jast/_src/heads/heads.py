@@ -6,20 +6,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jast._src.core.simulator import Simulator
+from jast._src.core.typing import Array
 from jast._src.heads.networks import Head
 from jast._src.util import display
 from jast._src.util.pytrees import as_partial
-
-if TYPE_CHECKING:
-    import chex
-
-    from jast._src.core.simulator import Simulator
 
 __all__ = [
     "Heads",
@@ -43,11 +40,11 @@ class Moments(NamedTuple):
         2.0
     """
 
-    count: chex.Array
+    count: Array
     """scalar float32."""
-    mean: chex.Array
+    mean: Array
     """[n] float32."""
-    deviation: chex.Array
+    deviation: Array
     """[n] float32: 0 where nothing varies; 1 is used in its place."""
 
     @classmethod
@@ -56,10 +53,10 @@ class Moments(NamedTuple):
             np.zeros((), np.float32), np.zeros(shape, np.float32), np.ones(shape, np.float32)
         )
 
-    def normalise(self, x: Any) -> chex.Array:
+    def normalise(self, x: Any) -> Array:
         return (x - self.mean) / self._scale()
 
-    def restore(self, x: Any) -> chex.Array:
+    def restore(self, x: Any) -> Array:
         return self.mean + self._scale() * x
 
     def _scale(self):

@@ -4,8 +4,6 @@ density.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import jax
 import jax.numpy as jnp
 from jax.tree_util import Partial
@@ -14,14 +12,10 @@ from jast import distributions as D
 from jast._src.core.policy import Policy
 from jast._src.core.signature import signature_of
 from jast._src.core.simulator import Simulator
+from jast._src.core.typing import Actions, Numeric
 from jast._src.distributions.flat_rows import flat, unflat
 from jast._src.heads.heads import Heads, observation, policy_logits, sample_bins
 from jast._src.heads.samples import cells
-
-if TYPE_CHECKING:
-    import chex
-
-    from jast._src.core.typing import Actions
 
 __all__ = ["as_policy"]
 
@@ -66,7 +60,7 @@ class Histogram(D.Distribution):
         return base + jnp.sum(logs).astype(base.dtype)
 
 
-def as_policy(sim: Simulator, heads: Heads, actions: Actions, power: chex.Numeric = 1.0) -> Policy:
+def as_policy(sim: Simulator, heads: Heads, actions: Actions, power: Numeric = 1.0) -> Policy:
     """The policy head of some heads as a `jast.Policy`; x0 is drawn from the system's own start.
 
     Args:

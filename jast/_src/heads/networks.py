@@ -7,14 +7,13 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax.tree_util import Partial
 
-if TYPE_CHECKING:
-    import chex
+from jast._src.core.typing import PRNGKey
 
 __all__ = ["ACTIVATIONS", "Head", "adam", "adam_step", "dense", "make_head"]
 
@@ -47,7 +46,7 @@ class Head(NamedTuple):
 
 
 def make_head(
-    key: chex.PRNGKey,
+    key: PRNGKey,
     inputs: int,
     outputs: Sequence[int] = (),
     *,

@@ -4,20 +4,18 @@ its function is made of.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jast._src.core.typing import PathLike
 from jast._src.heads.heads import Heads
 from jast._src.heads.networks import ACTIVATIONS, Head, dense
 from jast._src.io import save_load
 from jast._src.io.codec import Given, check_fits
 from jast._src.util.checks import whole_number
-
-if TYPE_CHECKING:
-    from jast._src.core.typing import PathLike
 
 __all__ = ["load", "parts", "whole"]
 

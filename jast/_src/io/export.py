@@ -8,7 +8,7 @@ import csv
 import json
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import jax
 import numpy as np
@@ -16,10 +16,8 @@ import numpy as np
 from jast._src.core.episode import Episode, replay
 from jast._src.core.signature import signature_of
 from jast._src.core.simulator import Simulator
+from jast._src.core.typing import PathLike
 from jast._src.util.leaf_names import path_name
-
-if TYPE_CHECKING:
-    from jast._src.core.typing import PathLike
 
 __all__ = ["by_step", "from_json", "to_csv", "to_numpy"]
 

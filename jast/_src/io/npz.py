@@ -13,13 +13,12 @@ import json
 import os
 import zipfile
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 
-if TYPE_CHECKING:
-    from jast._src.core.typing import PathLike
+from jast._src.core.typing import PathLike
 
 __all__ = ["pack", "read", "unpack", "write"]
 

@@ -7,15 +7,13 @@ a version and a checksum (`io.npz`), and the result itself as `io.codec` has it.
 from __future__ import annotations
 
 import importlib
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from jast._src.core.typing import PathLike
 from jast._src.io import former_files, npz
 from jast._src.io.codec import Given, check_episodes, decode, encode, place_of
-
-if TYPE_CHECKING:
-    from jast._src.core.typing import PathLike
 
 __all__ = ["from_bytes", "load", "parts", "restore", "save", "store", "to_bytes", "whole"]
 

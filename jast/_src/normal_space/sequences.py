@@ -7,7 +7,7 @@ Shared by the search `jast.search.cem`, the objective of `jast.cross_entropy.ove
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -16,9 +16,7 @@ from jax.tree_util import Partial
 from jast import distributions as D
 from jast._src.core import actions as choices
 from jast._src.core.policy import Policy
-
-if TYPE_CHECKING:
-    import chex
+from jast._src.core.typing import ArrayTree
 
 __all__ = [
     "Steps",
@@ -36,8 +34,8 @@ class Steps(NamedTuple):
     floats.
     """
 
-    mean: chex.ArrayTree
-    deviation: chex.ArrayTree
+    mean: ArrayTree
+    deviation: ArrayTree
 
 
 def standard_normal(like, steps, deviation=1):

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -27,15 +27,13 @@ from jast._src.core.rewards import likelihood
 from jast._src.core.signature import signature_of
 from jast._src.core.simulator import Simulator
 from jast._src.core.transition import Progress, advance, begin, conclude
+from jast._src.core.typing import Array
 from jast._src.distributions.flat_rows import unflat
 from jast._src.normal_space.sequences import latent_policy
 from jast._src.runtime._jax import jit, quick
 from jast._src.runtime.host_errors import runs_on_host
 from jast._src.util.blocked_matmul import product, rows_of
 from jast._src.util.pytrees import count_numbers, map_in_lanes
-
-if TYPE_CHECKING:
-    import chex
 
 __all__ = [
     "Latent",
@@ -70,17 +68,17 @@ LANES = 32  # episodes that are played side by side, so that one program serves 
 class Outcomes(NamedTuple):
     """What episodes [n] came to."""
 
-    failure: chex.Array
+    failure: Array
     """bool"""
-    distance: chex.Array
+    distance: Array
     """Miss distance; inf where invalid"""
-    used: chex.Array
+    used: Array
     """int32: how many of the numbers of z decided it"""
-    length: chex.Array
+    length: Array
     """int32: steps"""
-    invalid: chex.Array
+    invalid: Array
     """bool"""
-    log_p: chex.Array | None = None
+    log_p: Array | None = None
     """Log density of its disturbances, relative to the mode where these have modes; None where
     nobody asked"""
 
@@ -97,13 +95,13 @@ class Outcomes(NamedTuple):
 class Latent(NamedTuple):
     """A mixture of K Gaussians over z [D], one drawn a trace."""
 
-    log_weights: chex.Array
+    log_weights: Array
     """[K], of sum 1 as probabilities; -inf for a component that is not used"""
-    means: chex.Array
+    means: Array
     """[K, D]"""
-    factors: chex.Array
+    factors: Array
     """[K, D, D] lower Cholesky factors of the covariances"""
-    inverses: chex.Array
+    inverses: Array
     """[K, D, D] their inverses"""
 
 

@@ -11,24 +11,19 @@ import math
 from collections.abc import Sequence
 from numbers import Real
 from operator import index
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import jax
 import numpy as np
 
-from jast._src.core.episode import replay
+from jast._src.core.episode import Episode, replay
+from jast._src.core.simulator import Simulator
+from jast._src.core.typing import PathLike
 from jast._src.plot import style
+from jast._src.plot.style import Axes, FuncAnimation
 from jast._src.simulators.colav.planner import SPEEDS, STILL, ZONES
 from jast._src.simulators.colav.system import COLLISION, ColavState
 from jast._src.simulators.colav.tracker import PERIOD
-
-if TYPE_CHECKING:
-    from matplotlib.animation import FuncAnimation
-    from matplotlib.axes import Axes
-
-    from jast._src.core.episode import Episode
-    from jast._src.core.simulator import Simulator
-    from jast._src.core.typing import PathLike
 
 __all__ = ["colav", "colav_animation", "colav_story", "draw_moments", "zone_outline"]
 

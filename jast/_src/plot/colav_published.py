@@ -3,20 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from jast._src.core.episode import Episode
+from jast._src.core.simulator import Simulator
 from jast._src.plot import style
 from jast._src.plot.colav import draw_moments, zone_outline
+from jast._src.plot.style import Axes
 from jast._src.simulators.colav.planner import ZONES
 from jast._src.simulators.colav.tracker import PERIOD
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
-    from jast._src.core.episode import Episode
-    from jast._src.core.simulator import Simulator
 
 __all__ = ["colav_published"]
 

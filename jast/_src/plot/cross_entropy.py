@@ -5,19 +5,16 @@ looked, and how fast several runs converge.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jast._src.core.typing import Objective
 from jast._src.plot import style
+from jast._src.plot.style import Axes
 from jast.cross_entropy import CEResult, Mixture, scores
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
-    from jast._src.core.typing import Objective
 
 __all__ = ["convergence", "proposal_contours", "surrogate_samples"]
 

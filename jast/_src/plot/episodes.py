@@ -5,7 +5,7 @@ came.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import jax
 import numpy as np
@@ -15,13 +15,9 @@ from jast._src.core.simulator import Simulator
 from jast._src.distributions.standardised import spread
 from jast._src.normal_space import transform
 from jast._src.plot import style
+from jast._src.plot.style import Axes
+from jast._src.search.result import SearchResult
 from jast._src.util.leaf_names import named_fields
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
-    from jast._src.search.result import SearchResult
-
 
 __all__ = ["disturbances", "distances", "history", "shade_deviations", "spreads"]
 

@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from jast._src.plot import style
+from jast._src.plot.style import Axes
 from jast.estimate import Estimate, Exceedance
 from jast.estimate import exceedance as curve_of
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
 
 __all__ = ["exceedance"]
 

@@ -3,20 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from jast._src.core.typing import Array
 from jast._src.plot import style
+from jast._src.plot.style import Axes
 from jast._src.plot.weakness import checked_result
 from jast._src.util.checks import whole_number
 from jast._src.weakness.data import check_data
-
-if TYPE_CHECKING:
-    import chex
-    from matplotlib.axes import Axes
-
-    from jast._src.weakness.result import Result
+from jast._src.weakness.result import Result
 
 __all__ = ["contributions", "first_failures"]
 
@@ -28,8 +24,8 @@ EFFECTS = {1: ("raises", style.VERMILION), -1: ("lowers", style.BLUE), 0: ("neit
 
 def first_failures(
     result: Result,
-    inputs: chex.Array,
-    labels: chex.Array,
+    inputs: Array,
+    labels: Array,
     count: int = 20,
     names: Sequence[str] | None = None,
     axes: Sequence[Axes] | None = None,
@@ -115,9 +111,9 @@ def first_failures(
 
 
 def contributions(
-    values: chex.Array,
+    values: Array,
     names: Sequence[str] | None = None,
-    background: chex.Array | None = None,
+    background: Array | None = None,
     ax: Axes | None = None,
 ) -> Axes:
     """Which features mark the weakness: the mean magnitude of their contributions to the log odds

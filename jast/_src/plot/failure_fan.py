@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import jax
 import numpy as np
@@ -20,10 +20,7 @@ from jast._src.plot.series import (
     samples_of,
     series_of,
 )
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
+from jast._src.plot.style import Axes
 
 __all__ = ["failure_fan"]
 

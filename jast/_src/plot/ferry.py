@@ -2,20 +2,14 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
-from jast._src.core.episode import replay
+from jast._src.core.episode import Episode, replay
+from jast._src.core.simulator import Simulator
 from jast._src.plot import style
+from jast._src.plot.style import Axes
 from jast._src.simulators.ferry import COLLISION, FerryState
 from jast._src.simulators.ferry import ferry as ferry_simulator
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
-    from jast._src.core.episode import Episode
-    from jast._src.core.simulator import Simulator
 
 __all__ = ["ferry"]
 

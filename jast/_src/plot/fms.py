@@ -6,7 +6,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import partial
-from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
@@ -15,15 +14,12 @@ import numpy as np
 from jast._src.core.episode import Episode
 from jast._src.core.simulator import Simulator
 from jast._src.plot import style
+from jast._src.plot.style import Axes
 from jast._src.simulators.fms.database import FIXES, KLAX, KSFO
 from jast._src.simulators.fms.events import EVENTS, FOOT, extent
 from jast._src.simulators.fms.geodesic import direct, inverse
 from jast._src.simulators.fms.lateral import NMI
 from jast._src.simulators.fms.system import fms_path
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
 
 __all__ = ["fms"]
 

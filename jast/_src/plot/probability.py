@@ -5,16 +5,14 @@ trusted.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from jast._src.estimate.estimate import guaranteed_words, is_doubtful
 from jast._src.plot import style
+from jast._src.plot.style import Axes
 from jast.estimate import Estimate, Traces, pareto_k
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
 
 __all__ = ["probability", "weights"]
 

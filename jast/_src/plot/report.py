@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import jax
 import numpy as np
 
+from jast._src.core.episode import Episode
 from jast._src.core.signature import signature_of
 from jast._src.core.simulator import Simulator
 from jast._src.io.codec import name_of
@@ -25,6 +26,7 @@ from jast._src.plot.series import (
     series_of,
     undisturbed_series,
 )
+from jast._src.plot.style import Figure
 from jast._src.plot.traces import draw_traces
 from jast._src.runtime.host_errors import runs_on_host
 from jast._src.stress_testing.report_words import (
@@ -38,9 +40,6 @@ from jast._src.stress_testing.report_words import (
 from jast._src.util.leaf_names import named_fields
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
-    from jast._src.core.episode import Episode
     from jast.stress_testing import Report
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -11,9 +11,7 @@ import numpy as np
 
 from jast._src.cross_entropy.objectives import sierra as objective
 from jast._src.plot import style
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
+from jast._src.plot.style import Axes
 
 __all__ = ["sierra"]
 

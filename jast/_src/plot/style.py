@@ -4,17 +4,29 @@ from contextlib import contextmanager
 from io import BytesIO
 from operator import index
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, NewType
 
 import numpy as np
 
 from jast._src.core.episode import Episode
 
+if TYPE_CHECKING:
+    from matplotlib.animation import FuncAnimation
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+else:  # they are imported when something is drawn
+    Axes, Figure, FuncAnimation = (
+        NewType(name, object) for name in ("Axes", "Figure", "FuncAnimation")
+    )
+
 __all__ = [
+    "Axes",
     "BLUE",
     "COLOURS",
     "DASHED",
     "DOTTED",
+    "Figure",
+    "FuncAnimation",
     "GREEN",
     "GREY",
     "INK",

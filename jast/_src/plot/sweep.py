@@ -9,10 +9,9 @@ import numpy as np
 
 from jast._src.io.codec import name_of
 from jast._src.plot import style
+from jast._src.plot.style import Axes
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
     from jast.sweeping import Sweep
 
 

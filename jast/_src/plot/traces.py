@@ -5,10 +5,12 @@ another.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from jast._src.core.episode import Episode
+from jast._src.core.simulator import Simulator
 from jast._src.plot import style
 from jast._src.plot.series import (
     DISTANCE,
@@ -22,13 +24,7 @@ from jast._src.plot.series import (
     series_of,
     undisturbed_series,
 )
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
-    from jast._src.core.episode import Episode
-    from jast._src.core.simulator import Simulator
-
+from jast._src.plot.style import Axes
 
 __all__ = ["draw_traces", "phase", "traces"]
 

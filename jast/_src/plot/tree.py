@@ -5,18 +5,14 @@ page whose nodes open.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from jast._src.core.typing import PathLike
 from jast._src.page.tree_nodes import nodes_of
 from jast._src.plot import style
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
-    from jast._src.core.typing import PathLike
-
+from jast._src.plot.style import Axes
 
 __all__ = ["tree", "tree_page"]
 

@@ -8,16 +8,13 @@ were invalid, and those that a tree did not simulate as it had come to their end
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
 
 from jast._src.plot import style
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
-    from jast._src.search.result import SearchResult
+from jast._src.plot.style import Axes
+from jast._src.search.result import SearchResult
 
 __all__ = ["trial_distances", "trials"]
 

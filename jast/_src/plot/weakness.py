@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from jast._src.core.typing import Array
 from jast._src.plot import style
+from jast._src.plot.style import Axes
 from jast._src.weakness import measures
 from jast._src.weakness.result import Result
-
-if TYPE_CHECKING:
-    import chex
-    from matplotlib.axes import Axes
 
 __all__ = ["checked_result", "checked_truth", "failures_found", "roc"]
 
@@ -22,7 +20,7 @@ LIGHT, DARK = "#A9CCE6", "#06263D"  # of the first and the last iteration
 
 def failures_found(
     results: Result | Sequence[Result] | Mapping[str, Any],
-    failed: chex.Array | None = None,
+    failed: Array | None = None,
     ax: Axes | None = None,
 ) -> Axes:
     """Failures found against calls of the system, call by call, and beside them the most that can
@@ -92,7 +90,7 @@ def failures_found(
 
 def roc(
     result: Result,
-    failed: chex.Array,
+    failed: Array,
     iterations: Sequence[int] | None = None,
     ax: Axes | None = None,
 ) -> Axes:

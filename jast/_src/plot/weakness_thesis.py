@@ -7,22 +7,18 @@ R. J. Moss, "Algorithms for Efficient Validation of Black-Box Systems", Stanford
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
 
+from jast._src.core.typing import Array
 from jast._src.plot import style
+from jast._src.plot.style import Axes
 from jast._src.plot.weakness import checked_result, checked_truth
 from jast._src.util.checks import number, whole_number
 from jast._src.weakness.encoded import Encoded
 from jast._src.weakness.measures import precision_recall
-
-if TYPE_CHECKING:
-    import chex
-    from matplotlib.axes import Axes
-
-    from jast._src.weakness.result import Result
-
+from jast._src.weakness.result import Result
 
 __all__ = ["confusion", "likely_failures", "pixel_likelihood", "threshold_sweep"]
 
@@ -31,7 +27,7 @@ KINDS = ("true positives", "false negatives", "likely failures")
 
 
 def confusion(
-    result: Result, failed: chex.Array, threshold: float = 0.5, ax: Axes | None = None
+    result: Result, failed: Array, threshold: float = 0.5, ax: Axes | None = None
 ) -> Axes:
     """How many inputs a score of at least ``threshold`` calls failures, against the truth: the
     confusion matrix of the adversary (figure 4.3b of the thesis).
@@ -78,7 +74,7 @@ def confusion(
 
 def threshold_sweep(
     result: Result,
-    failed: chex.Array,
+    failed: Array,
     thresholds: int | Sequence[float] = 21,
     ax: Axes | None = None,
 ) -> Axes:
@@ -117,8 +113,8 @@ def threshold_sweep(
 
 def likely_failures(
     networks: Encoded,
-    inputs: chex.Array,
-    failed: chex.Array,
+    inputs: Array,
+    failed: Array,
     kind: Literal["true positives", "false negatives", "likely failures"] = "true positives",
     count: int = 10,
     axes: Sequence[Axes] | None = None,

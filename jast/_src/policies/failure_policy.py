@@ -6,7 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -20,10 +20,8 @@ from jast._src.heads.heads import observation
 from jast._src.policies.actor import Normalisation, latent_mixture, network_inputs
 from jast._src.policies.lanes import potential
 from jast._src.policies.start_fit import Tilt
+from jast._src.policies.training_state import Totals
 from jast._src.util import display
-
-if TYPE_CHECKING:
-    from jast._src.policies.training_state import Totals
 
 __all__ = ["FailurePolicy", "History", "Learned", "append_row", "assemble", "history_of"]
 

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import jax
 import jax.numpy as jnp
 
 from jast._src.core.simulator import Simulator
+from jast._src.core.typing import Callback, PathLike, PRNGKey
 from jast._src.policies import proximal_training
 from jast._src.policies.actor import make_networks
 from jast._src.policies.failure_policy import FailurePolicy
@@ -17,12 +18,6 @@ from jast._src.policies.settings import Asked, is_auto
 from jast._src.policies.train_policy import Method, train_policy
 from jast._src.policies.training_state import explore, init_training
 from jast._src.runtime.memory import require, size
-
-if TYPE_CHECKING:
-    import chex
-
-    from jast._src.core.typing import Callback, PathLike
-
 
 __all__ = ["ppo"]
 
@@ -34,7 +29,7 @@ EXPLORED = 100_000  # transitions of the exploration whose moments are taken; a 
 
 
 def ppo(
-    key: chex.PRNGKey,
+    key: PRNGKey,
     sim: Simulator,
     *,
     episodes: int = 12_000,

@@ -6,13 +6,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from jast._src.core.simulator import Simulator
+from jast._src.core.typing import Array, Callback, PathLike, PRNGKey
 from jast._src.policies import q_learning_training
 from jast._src.policies.failure_policy import FailurePolicy
 from jast._src.policies.settings import Asked, is_auto
@@ -21,24 +22,19 @@ from jast._src.policies.training_state import explore
 from jast._src.runtime.memory import require
 from jast._src.util.checks import whole_number
 
-if TYPE_CHECKING:
-    import chex
-
-    from jast._src.core.typing import Callback, PathLike
-
 __all__ = ["q_learning"]
 
 EXPLORED = 100_000  # transitions of the exploration that the ranges are taken of; a convention
 
 
 def q_learning(
-    key: chex.PRNGKey,
+    key: PRNGKey,
     sim: Simulator,
     *,
     episodes: int = 25_000,
     cells: int | Sequence[int] = 50,
-    cell: Callable[[chex.Array, chex.Array], chex.Array] | None = None,
-    ranges: Sequence[Sequence[float]] | chex.Array | Literal["auto"] = "auto",
+    cell: Callable[[Array, Array], Array] | None = None,
+    ranges: Sequence[Sequence[float]] | Array | Literal["auto"] = "auto",
     values: int = 13,
     reach: float = 3.0,
     scale: float | Literal["auto"] = "auto",

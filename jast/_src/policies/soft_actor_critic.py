@@ -6,12 +6,13 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import jax
 import jax.numpy as jnp
 
 from jast._src.core.simulator import Simulator
+from jast._src.core.typing import Callback, PathLike, PRNGKey
 from jast._src.policies import soft_actor_critic_training
 from jast._src.policies.actor import make_networks
 from jast._src.policies.failure_policy import FailurePolicy
@@ -20,12 +21,6 @@ from jast._src.policies.train_policy import Method, train_policy
 from jast._src.policies.training_state import init_training
 from jast._src.runtime.memory import require, size
 
-if TYPE_CHECKING:
-    import chex
-
-    from jast._src.core.typing import Callback, PathLike
-
-
 __all__ = ["sac"]
 
 UPDATES = 5000  # in all, where nobody says; a convention
@@ -33,7 +28,7 @@ CRITICS_ALONE = 0.1  # fraction of the learning in which the actor does not lear
 
 
 def sac(
-    key: chex.PRNGKey,
+    key: PRNGKey,
     sim: Simulator,
     *,
     episodes: int = 12_000,

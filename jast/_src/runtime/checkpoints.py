@@ -24,18 +24,16 @@ import struct
 import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, BinaryIO, NamedTuple, TextIO
+from typing import Any, BinaryIO, NamedTuple, TextIO
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jast._src.core.typing import Array
 from jast._src.io import npz, save_load
 from jast._src.io.fingerprint import describe_differences, fingerprint
 from jast._src.runtime.host_errors import sources
-
-if TYPE_CHECKING:
-    import chex
 
 __all__ = [
     "PARTS",
@@ -158,7 +156,7 @@ class Checkpoint:
             begin = end
         return arrays
 
-    def put(self, number: int, arrays: list[chex.Array], name: str) -> None:
+    def put(self, number: int, arrays: list[Array], name: str) -> None:
         """Keep the arrays of a part. OSError where they cannot be written."""
         arrays = [np.asarray(a) for a in arrays]
         header = dict(arrays=[[a.dtype.name, a.shape] for a in arrays])

@@ -6,15 +6,12 @@ import contextlib
 import os
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import jax
 
+from jast._src.core.typing import PathLike
 from jast._src.runtime._jax import reset_cache
 from jast._src.util.checks import whole_number
-
-if TYPE_CHECKING:
-    from jast._src.core.typing import PathLike
 
 __all__ = ["cache"]
 

@@ -7,13 +7,12 @@ from __future__ import annotations
 import contextlib
 import threading
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 from jax.tree_util import Partial
 
-if TYPE_CHECKING:
-    from jast._src.core.simulator import Simulator
+from jast._src.core.simulator import Simulator
 
 __all__ = [
     "Incident",

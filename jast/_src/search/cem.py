@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -20,8 +20,10 @@ from jax import lax
 from jast._src.core import actions as choices
 from jast._src.core.counter_prng import tree_keys
 from jast._src.core.episode import Episode
+from jast._src.core.failures import Failures
 from jast._src.core.signature import signature_of
 from jast._src.core.simulator import Simulator, require_simulator
+from jast._src.core.typing import Actions, Callback, PathLike, PRNGKey, Reward
 from jast._src.normal_space import sequences
 from jast._src.runtime import work
 from jast._src.runtime._jax import jit
@@ -35,12 +37,6 @@ from jast._src.search.refine.final import default_share, with_refine_share
 from jast._src.search.result import SearchResult, Trials
 from jast._src.search.setup import default_actions, prepare
 from jast._src.util import checks
-
-if TYPE_CHECKING:
-    import chex
-
-    from jast._src.core.failures import Failures
-    from jast._src.core.typing import Actions, Callback, PathLike, Reward
 
 __all__ = ["cem"]
 
@@ -83,7 +79,7 @@ class State(NamedTuple):
 
 
 def cem(
-    key: chex.PRNGKey,
+    key: PRNGKey,
     sim: Simulator,
     *,
     samples: int = 300,

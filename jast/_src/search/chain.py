@@ -10,13 +10,14 @@ density of z is Gaussian, and the proposal has that drift already, exactly.
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 
 from jast._src.core.counter_prng import tree_keys
 from jast._src.core.simulator import Simulator
+from jast._src.core.typing import Callback, PathLike, PRNGKey
 from jast._src.normal_space.pcn import WIDTHS
 from jast._src.normal_space.transform import check, dimension, normal_numbers
 from jast._src.runtime.host_errors import runs_on_host
@@ -28,11 +29,6 @@ from jast._src.search.refine.final import SHARE, with_refine_share
 from jast._src.search.result import SearchResult
 from jast._src.util import checks
 from jast._src.util.display import call_settings
-
-if TYPE_CHECKING:
-    import chex
-
-    from jast._src.core.typing import Callback, PathLike
 
 __all__ = ["chain"]
 
@@ -64,7 +60,7 @@ class State(NamedTuple):
 
 
 def chain(
-    key: chex.PRNGKey,
+    key: PRNGKey,
     sim: Simulator,
     *,
     episodes: int = 100_000,

@@ -9,7 +9,7 @@ those by `runtime.work` and end by `complete` too.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, TypeVar
+from typing import Any, NamedTuple, Protocol, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -18,6 +18,7 @@ import numpy as np
 from jast._src.core import failures as archive
 from jast._src.core.episode import Episode, replay
 from jast._src.core.simulator import Simulator
+from jast._src.core.typing import Callback, PathLike
 from jast._src.runtime._jax import is_traced, is_tracing
 from jast._src.runtime.checkpoints import keep_answers, open_checkpoint, step_once
 from jast._src.runtime.host_errors import (
@@ -34,9 +35,6 @@ from jast._src.search.lanes import NEVER, Tally
 from jast._src.search.refine.final import refine_failures
 from jast._src.search.result import History, SearchResult, Trials
 from jast._src.util import checks
-
-if TYPE_CHECKING:
-    from jast._src.core.typing import Callback, PathLike
 
 __all__ = [
     "NOTHING_NOTED",

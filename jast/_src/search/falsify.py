@@ -10,7 +10,7 @@ level that is held, at an end of its range for some seconds.
 from __future__ import annotations
 
 from functools import partial
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -18,6 +18,7 @@ import numpy as np
 
 from jast._src.core.signature import signature_of
 from jast._src.core.simulator import Simulator
+from jast._src.core.typing import Callback, PathLike, PRNGKey
 from jast._src.normal_space.transform import Outcomes, check, normal_numbers, outcome, played
 from jast._src.runtime._jax import jit
 from jast._src.runtime.host_errors import in_full_batches
@@ -27,11 +28,6 @@ from jast._src.search.lanes import NEVER, Tally
 from jast._src.search.result import SearchResult
 from jast._src.util.display import call_settings
 from jast._src.util.pytrees import count_numbers, map_in_lanes
-
-if TYPE_CHECKING:
-    import chex
-
-    from jast._src.core.typing import Callback, PathLike
 
 __all__ = ["falsify"]
 
@@ -87,7 +83,7 @@ class State(NamedTuple):
 
 
 def falsify(
-    key: chex.PRNGKey,
+    key: PRNGKey,
     sim: Simulator,
     *,
     simulations: int = 300,

@@ -5,20 +5,17 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
+import jax
+
+from jast._src.core.simulator import Simulator
+from jast._src.core.typing import Actions, Callback, Executor, PathLike, PRNGKey, Reward
+from jast._src.heads.heads import Heads
+from jast._src.heads.settings import HeadSettings
+from jast._src.search.result import SearchResult
 from jast._src.search.tree.forest_run import grow_trees
 from jast._src.search.tree.settings import PLAIN
-
-if TYPE_CHECKING:
-    import chex
-    import jax
-
-    from jast._src.core.simulator import Simulator
-    from jast._src.core.typing import Actions, Callback, Executor, PathLike, Reward
-    from jast._src.heads.heads import Heads
-    from jast._src.heads.settings import HeadSettings
-    from jast._src.search.result import SearchResult
 
 __all__ = ["MODES", "forest"]
 
@@ -36,7 +33,7 @@ MODES = {
 
 
 def forest(
-    key: chex.PRNGKey,
+    key: PRNGKey,
     sim: Simulator,
     *,
     trees: int = 200,

@@ -5,13 +5,14 @@ the likeliest failures (`normal_space.design_point_descent`, `jast.search.refine
 from __future__ import annotations
 
 from functools import partial
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 
 from jast._src.core.episode import Episode, play_back
 from jast._src.core.simulator import Simulator
+from jast._src.core.typing import Callback, PathLike, PRNGKey
 from jast._src.normal_space.design_point_descent import EPISODES, STEPS, descents
 from jast._src.normal_space.transform import check, dimension, normal_numbers, played, side_by_side
 from jast._src.runtime._jax import jit
@@ -24,11 +25,6 @@ from jast._src.search.refine.refine import GRADIENT, first_failing_lift, lift
 from jast._src.search.result import SearchResult
 from jast._src.util.display import call_settings
 
-if TYPE_CHECKING:
-    import chex
-
-    from jast._src.core.typing import Callback, PathLike
-
 __all__ = ["gradient"]
 
 SHARE = 2.0
@@ -38,7 +34,7 @@ EVALUATIONS = STEPS * GRADIENT + EPISODES
 
 
 def gradient(
-    key: chex.PRNGKey,
+    key: PRNGKey,
     sim: Simulator,
     *,
     starts: int = 48,

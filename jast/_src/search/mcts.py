@@ -5,24 +5,21 @@ classic of adaptive stress testing.
 from __future__ import annotations
 
 import inspect
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from jast._src.core.simulator import Simulator
+from jast._src.core.typing import PRNGKey
 from jast._src.search.forest import MODES as FOREST_MODES
 from jast._src.search.forest import forest
+from jast._src.search.result import SearchResult
 from jast._src.search.tree.forest_run import grow_trees
-
-if TYPE_CHECKING:
-    import chex
-
-    from jast._src.core.simulator import Simulator
-    from jast._src.search.result import SearchResult
 
 __all__ = ["MODES", "mcts"]
 
 MODES = FOREST_MODES | dict(default=FOREST_MODES["default"] | dict(widening=(1.0, 0.5)))
 
 
-def mcts(key: chex.PRNGKey, sim: Simulator, **settings: Any) -> SearchResult:
+def mcts(key: PRNGKey, sim: Simulator, **settings: Any) -> SearchResult:
     """Grow independent trees from their first root: `jast.search.forest` without its action
     pruning. The reward is maximised.
 

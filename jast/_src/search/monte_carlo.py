@@ -6,7 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import partial
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -17,6 +17,7 @@ from jast._src.core import actions as choices
 from jast._src.core.counter_prng import tree_keys
 from jast._src.core.signature import signature_of
 from jast._src.core.simulator import Simulator
+from jast._src.core.typing import Actions, Callback, Executor, PathLike, PRNGKey, Reward
 from jast._src.runtime import work
 from jast._src.runtime._jax import jit, quick
 from jast._src.runtime.backends import Task
@@ -36,15 +37,9 @@ from jast._src.search.driver import (
 )
 from jast._src.search.lanes import Tally, distinct_episodes, play_lanes
 from jast._src.search.refine.final import default_share, with_refine_share
-from jast._src.search.result import Trials
+from jast._src.search.result import SearchResult, Trials
 from jast._src.search.setup import prepare
 from jast._src.util.pytrees import map_in_lanes
-
-if TYPE_CHECKING:
-    import chex
-
-    from jast._src.core.typing import Actions, Callback, Executor, PathLike, Reward
-    from jast._src.search.result import SearchResult
 
 __all__ = ["monte_carlo"]
 
@@ -79,7 +74,7 @@ SAMPLES = choices.samples()
 
 
 def monte_carlo(
-    key: chex.PRNGKey,
+    key: PRNGKey,
     sim: Simulator,
     *,
     episodes: int = 100_000,

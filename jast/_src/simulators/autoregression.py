@@ -8,24 +8,18 @@ agree to 1e-9): P = 1.7438880336e-5.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import jax.numpy as jnp
 from jax.tree_util import Partial
 
 from jast._src.core.simulator import Simulator
+from jast._src.core.typing import Numeric
 from jast._src.simulators.parameter import positive
 from jast.distributions import Normal
-
-if TYPE_CHECKING:
-    import chex
 
 __all__ = ["autoregression"]
 
 
-def autoregression(
-    rate: chex.Numeric = 0.1, threshold: chex.Numeric = 5.0, horizon: int = 100
-) -> Simulator:
+def autoregression(rate: Numeric = 0.1, threshold: Numeric = 5.0, horizon: int = 100) -> Simulator:
     """An autoregressive process from 0: a `Simulator` with a scalar state of variance below 1 and a
     standard normal x (scalar). It fails where the state reaches a threshold; miss distance:
     max(threshold - s, 0).

@@ -31,19 +31,16 @@ import importlib.metadata
 import io
 import threading
 from functools import partial
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 
+from jast._src.core.simulator import Simulator
+from jast._src.core.typing import Array
 from jast._src.util.checks import real_number, whole_number
 from jast.blackbox import from_python
 from jast.distributions import Independent, Normal
-
-if TYPE_CHECKING:
-    import chex
-
-    from jast._src.core.simulator import Simulator
 
 __all__ = ["MEANS", "SIGMAS", "Flight", "bluesky", "bluesky_flight"]
 
@@ -137,7 +134,7 @@ def bluesky(
     )
 
 
-def bluesky_flight(disturbances: chex.Array) -> Flight:
+def bluesky_flight(disturbances: Array) -> Flight:
     """The flight of one episode of `bluesky`, flown by the BlueSky of this process.
 
     Args:

@@ -10,7 +10,7 @@ var = .04737 and their mirror image, var = .019.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -18,11 +18,9 @@ from jax.scipy.special import ndtr
 from jax.tree_util import Partial
 
 from jast._src.core.simulator import Simulator
+from jast._src.core.typing import Array, Numeric
 from jast._src.simulators.parameter import positive
 from jast.distributions import Normal
-
-if TYPE_CHECKING:
-    import chex
 
 __all__ = ["LandingState", "landing", "landing_probability"]
 
@@ -36,9 +34,7 @@ class LandingState(NamedTuple):
     x2: jax.Array
 
 
-def landing(
-    b: chex.Numeric = 1.0, sigma_i: chex.Numeric = 0.1, sigma_t: chex.Numeric = 0.03
-) -> Simulator:
+def landing(b: Numeric = 1.0, sigma_i: Numeric = 0.1, sigma_t: Numeric = 0.03) -> Simulator:
     """A landing: an episodic `Simulator` of ten steps, with the initial offset as x0 (scalar) and
     the drift of a step as x (scalar). Miss distance: max(b - abs(offset), 0) at the end.
 
@@ -68,9 +64,7 @@ def landing(
     )
 
 
-def landing_probability(
-    b: chex.Numeric = 1.0, sigma_i: chex.Numeric = 0.1, sigma_t: chex.Numeric = 0.03
-) -> chex.Array:
+def landing_probability(b: Numeric = 1.0, sigma_i: Numeric = 0.1, sigma_t: Numeric = 0.03) -> Array:
     """The failure probability of `landing` in closed form: 2 Phi(-b / sqrt(sigma_i^2 + 10
     sigma_t^2)).
 

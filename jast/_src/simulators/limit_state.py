@@ -9,23 +9,21 @@ Known truths: hyperplane g = 5 - x.e, abs(e) = 1, any d: Phi(-5) = 2.8665157188e
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jax.tree_util import Partial
 
 from jast._src.core.simulator import Simulator
+from jast._src.core.typing import Array
 from jast._src.util.pytrees import as_partial
 from jast.distributions import MultivariateNormalDiag
-
-if TYPE_CHECKING:
-    import chex
 
 __all__ = ["limit_state"]
 
 
-def limit_state(g: Callable[[Any], chex.Array], dimension: int) -> Simulator:
+def limit_state(g: Callable[[Any], Array], dimension: int) -> Simulator:
     """A limit state function as an episodic `Simulator` of one step, x ~ N(0, I) [dimension]: a
     failure where g(x) <= 0, miss distance max(g(x), 0).
 

@@ -10,18 +10,16 @@ failure.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax.tree_util import Partial
 
 from jast._src.core.simulator import Simulator
+from jast._src.core.typing import Numeric
 from jast._src.simulators.parameter import positive
 from jast.distributions import MultivariateNormalDiag
-
-if TYPE_CHECKING:
-    import chex
 
 __all__ = ["PendulumState", "pendulum"]
 
@@ -39,10 +37,10 @@ class PendulumState(NamedTuple):
 
 
 def pendulum(
-    noise: chex.Numeric = 0.1,
-    sigma_theta: chex.Numeric = jnp.pi / 32,
-    sigma_omega: chex.Numeric = 0.5,
-    limit: chex.Numeric = jnp.pi / 4,
+    noise: Numeric = 0.1,
+    sigma_theta: Numeric = jnp.pi / 32,
+    sigma_omega: Numeric = 0.5,
+    limit: Numeric = jnp.pi / 4,
 ) -> Simulator:
     """A controlled pendulum: a `Simulator` of 40 steps, with (theta0, omega0) as x0 [2] and the
     error of the observation as x [2]. Miss distance: max(limit - abs(theta), 0).

@@ -9,24 +9,20 @@ Known truth (up = .4, start 1, goal 30), without a horizon: P = (r^start - 1) / 
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import jax.numpy as jnp
 from jax import lax
 from jax.tree_util import Partial
 
 from jast._src.core.simulator import Simulator
+from jast._src.core.typing import Array, Numeric
 from jast._src.runtime._jax import is_traced
 from jast._src.util.checks import real_number, whole_number
 from jast.distributions import Categorical
 
-if TYPE_CHECKING:
-    import chex
-
 __all__ = ["ruin", "ruin_probability"]
 
 
-def ruin(up: chex.Numeric = 0.4, start: int = 1, goal: int = 30, horizon: int = 371) -> Simulator:
+def ruin(up: Numeric = 0.4, start: int = 1, goal: int = 30, horizon: int = 371) -> Simulator:
     """A gambler: a `Simulator` with his fortune as the state (int32 scalar) and x = 1 (won) or 0
     (lost), int32. Reaching the goal is the failure; miss distance: max(goal - fortune, 0).
 
@@ -64,8 +60,8 @@ def ruin(up: chex.Numeric = 0.4, start: int = 1, goal: int = 30, horizon: int = 
 
 
 def ruin_probability(
-    up: chex.Numeric = 0.4, start: int = 1, goal: int = 30, horizon: int | None = None
-) -> chex.Array:
+    up: Numeric = 0.4, start: int = 1, goal: int = 30, horizon: int | None = None
+) -> Array:
     """The failure probability of `ruin`, scalar: in closed form without a horizon, else exactly,
     step by step.
 

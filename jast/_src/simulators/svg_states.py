@@ -6,10 +6,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from jast._src.core.typing import ArrayTree
 from jast._src.simulators import svg
 from jast._src.simulators.colav.planner import SPEEDS
 from jast._src.simulators.colav.system import COLLISION as TOUCH
@@ -18,9 +19,6 @@ from jast._src.simulators.ferry import COLLISION, FerryState
 from jast._src.simulators.pendulum import PendulumState
 from jast._src.simulators.svg import BLUE, GREEN, GREY, INK, VERMILION
 
-if TYPE_CHECKING:
-    import chex
-
 __all__ = ["DRAWN", "draw"]
 
 HULL = ((4.0, 0.0), (1.8, 1.5), (-4.0, 1.5), (-4.0, -1.5), (1.8, -1.5))
@@ -28,7 +26,7 @@ HULL = ((4.0, 0.0), (1.8, 1.5), (-4.0, 1.5), (-4.0, -1.5), (1.8, -1.5))
 TRAIL = 60  # places of a trail, at most
 
 
-def draw(state: chex.ArrayTree, past: chex.ArrayTree | None = None) -> str:
+def draw(state: ArrayTree, past: ArrayTree | None = None) -> str:
     """One state of `ferry`, `colav` or `pendulum` as an SVG picture.
 
     Args:

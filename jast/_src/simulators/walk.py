@@ -8,17 +8,15 @@ Known truth (sigma = 1, threshold = 10, failure at any step; quadrature, two gri
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import jax.numpy as jnp
 from jax.tree_util import Partial
 
 from jast._src.core.simulator import Simulator
+from jast._src.core.typing import Numeric
 from jast._src.simulators.parameter import positive
 from jast.distributions import Normal
-
-if TYPE_CHECKING:
-    import chex
 
 __all__ = ["walk1d"]
 
@@ -27,8 +25,8 @@ HORIZON = {"two-sided": 30, "one-sided": 10}  # steps of an episode, as publishe
 
 def walk1d(
     form: Literal["two-sided", "one-sided"] = "two-sided",
-    sigma: chex.Numeric = 1.0,
-    threshold: chex.Numeric = 10.0,
+    sigma: Numeric = 1.0,
+    threshold: Numeric = 10.0,
     horizon: int | None = None,
 ) -> Simulator:
     """A random walk from 0, s += x with x ~ N(0, sigma^2): a `Simulator` with a scalar state.

@@ -3,20 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from jast._src.core.failures import Failures
 from jast._src.core.nominal import Nominal
 from jast._src.core.simulator import Simulator
+from jast._src.core.typing import PathLike
 from jast._src.estimate.estimate import Estimate
 from jast._src.search.refine.modes import Modes
 from jast._src.stress_testing.report_words import advice, verdict_rows, work_rows
 from jast._src.util import display
-
-if TYPE_CHECKING:
-    from jast._src.core.typing import PathLike
 
 __all__ = ["Report", "Tried"]
 

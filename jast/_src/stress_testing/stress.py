@@ -5,7 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import jax
 import numpy as np
@@ -16,6 +16,7 @@ from jast._src.core.failures import Failures, collect, empty, merge
 from jast._src.core.nominal import BRIEF, nominal
 from jast._src.core.rewards import likelihood
 from jast._src.core.simulator import Simulator, require_simulator
+from jast._src.core.typing import Callback, Executor, PathLike, PRNGKey
 from jast._src.estimate import budgets
 from jast._src.estimate.budgets import MIN_POPULATION_BUDGET
 from jast._src.estimate.failure_probability import (
@@ -51,11 +52,6 @@ from jast._src.stress_testing.mode_shares import mode_shares, shares_cost
 from jast._src.stress_testing.report import Report, Tried
 from jast._src.util import checks
 from jast._src.util.display import call_settings
-
-if TYPE_CHECKING:
-    import chex
-
-    from jast._src.core.typing import Callback, Executor, PathLike
 
 __all__ = ["DEFAULT_BUDGET", "stress"]
 
@@ -127,7 +123,7 @@ COUNTING_SHARES = BudgetShares(nominal=0.125, search=0.35, slow_search=0.2, refi
 
 
 def stress(
-    key: chex.PRNGKey,
+    key: PRNGKey,
     sim: Simulator,
     budget: int | None = None,
     *,

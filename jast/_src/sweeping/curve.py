@@ -12,12 +12,13 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from statistics import NormalDist
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 
 from jast._src.core.counter_prng import numpy_generator
+from jast._src.core.simulator import Simulator
 from jast._src.estimate.budgets import uses_populations
 from jast._src.estimate.population.descents import SETTINGS
 from jast._src.estimate.population.failure_sample import Sample
@@ -27,9 +28,6 @@ from jast._src.normal_space.evaluate_points import evaluate_points
 from jast._src.normal_space.transform import Latent, dimension, used_numbers
 from jast._src.util.intervals import log_normal
 from jast.estimate import Estimate
-
-if TYPE_CHECKING:
-    from jast._src.core.simulator import Simulator
 
 __all__ = ["Curve", "join_rows"]
 

@@ -5,21 +5,19 @@ from __future__ import annotations
 import inspect
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 
+from jast._src.core.simulator import Simulator
+from jast._src.core.typing import Executor
 from jast._src.io import save_load
 from jast._src.runtime import work
 from jast._src.runtime._jax import was_interrupted
 from jast._src.runtime.backends import Task, UnitContext
-
-if TYPE_CHECKING:
-    from jast._src.core.simulator import Simulator
-    from jast._src.core.typing import Executor
-    from jast._src.runtime.checkpoints import Checkpoint
-    from jast._src.runtime.progress_bar import Watch
+from jast._src.runtime.checkpoints import Checkpoint
+from jast._src.runtime.progress_bar import Watch
 
 __all__ = ["Rows", "options_of", "run_here", "run_in_executor"]
 

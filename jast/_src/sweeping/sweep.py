@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import jax
 import numpy as np
 
 from jast._src.core.simulator import Simulator
+from jast._src.core.typing import Callback, Executor, PathLike, PRNGKey
 from jast._src.runtime.backends import check_executor
 from jast._src.runtime.checkpoints import open_checkpoint
 from jast._src.runtime.progress_bar import Watch, terminable
@@ -20,16 +21,11 @@ from jast._src.util.checks import check_random_key
 from jast._src.util.display import call_settings
 from jast.estimate import failure_probability
 
-if TYPE_CHECKING:
-    import chex
-
-    from jast._src.core.typing import Callback, Executor, PathLike
-
 __all__ = ["sweep"]
 
 
 def sweep(
-    key: chex.PRNGKey,
+    key: PRNGKey,
     simulators: Callable[..., Simulator] | Sequence[Simulator],
     values: Mapping[str, Iterable[Any]],
     function: Callable[..., Any] = failure_probability,

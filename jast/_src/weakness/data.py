@@ -9,15 +9,13 @@ import hashlib
 import math
 import zlib
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
+from jast._src.core.typing import PathLike
 from jast._src.util.checks import import_library, whole_number
 from jast._src.weakness.result import Result
-
-if TYPE_CHECKING:
-    from jast._src.core.typing import PathLike
 
 __all__ = [
     "Data",

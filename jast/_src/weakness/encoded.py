@@ -3,22 +3,19 @@
 from __future__ import annotations
 
 import json
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 
+from jast._src.core.typing import Array
 from jast._src.util import display
 from jast._src.weakness import networks
 from jast._src.weakness.data import data_of_result
 from jast._src.weakness.features import scale_inputs
+from jast._src.weakness.result import Result
 from jast._src.weakness.thesis_selector import adversary_of, train_encoder
 from jast._src.weakness.validation import iteration_key
-
-if TYPE_CHECKING:
-    import chex
-
-    from jast._src.weakness.result import Result
 
 __all__ = ["Encoded", "encoded"]
 
@@ -51,12 +48,12 @@ class Encoded(NamedTuple):
     hidden: tuple[int, ...]
     """The autoencoder's widths"""
 
-    def score(self, rows: chex.Array) -> chex.Array:
+    def score(self, rows: Array) -> Array:
         """A(E(x)) [m] of ``rows`` [m, d] in the scale of the autoencoder, 0 to 1."""
         codes = self._network.encode(self.autoencoder, np.asarray(rows, np.float32))
         return np.asarray(jax.nn.sigmoid(networks.logits(self.adversary, codes)))
 
-    def decode(self, codes: chex.Array) -> chex.Array:
+    def decode(self, codes: Array) -> Array:
         """What the decoder makes of ``codes`` [m, h]: [m, ...] in the shape of the inputs."""
         rows = self._network.decode(self.autoencoder, np.asarray(codes, np.float32))
         return np.asarray(rows).reshape(-1, *self.shape)
@@ -66,9 +63,7 @@ class Encoded(NamedTuple):
         return networks.autoencoder(int(np.prod(self.shape)), self.hidden)
 
 
-def encoded(
-    result: Result, inputs: chex.Array, labels: chex.Array, *, classes: int | None = None
-) -> Encoded:
+def encoded(result: Result, inputs: Array, labels: Array, *, classes: int | None = None) -> Encoded:
     """The `Encoded` networks of a result of the thesis's selector.
 
     A result keeps the codes and the adversary, not the autoencoder, which is trained here once more

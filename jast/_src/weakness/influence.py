@@ -5,21 +5,17 @@ that imitate the system.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from jast._src.core.counter_prng import numpy_generator
+from jast._src.core.typing import Array, PRNGKey
 from jast._src.util.checks import check_random_key
 from jast._src.weakness import committee
 from jast._src.weakness.data import are_indices, data_of_result
 from jast._src.weakness.default_selector import PASSES, STRENGTH
 from jast._src.weakness.features import centre, scale_inputs
-
-if TYPE_CHECKING:
-    import chex
-
-    from jast._src.weakness.result import Result
+from jast._src.weakness.result import Result
 
 __all__ = ["influence"]
 
@@ -28,12 +24,12 @@ EFFORT = 4  # times the passes of the selector's committee: there is one fit, no
 
 
 def influence(
-    key: chex.PRNGKey,
+    key: PRNGKey,
     result: Result,
-    inputs: chex.Array,
-    labels: chex.Array,
+    inputs: Array,
+    labels: Array,
     *,
-    at: chex.Array | Sequence[int] | None = None,
+    at: Array | Sequence[int] | None = None,
     classes: int | None = None,
 ) -> np.ndarray:
     """What each number of an input contributes to the log odds that the system gets it wrong.

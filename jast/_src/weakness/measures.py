@@ -4,16 +4,14 @@ recall.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
+from jast._src.core.typing import Array
 from jast._src.util import display
 from jast._src.util.checks import number, whole_number
 from jast._src.weakness.result import Result
-
-if TYPE_CHECKING:
-    import chex
 
 __all__ = ["Judgement", "Roc", "auc", "judge", "precision_recall", "roc"]
 
@@ -68,7 +66,7 @@ class Judgement(NamedTuple):
     """[R] int: inputs with a score of at least the threshold, or the ``top``"""
 
 
-def roc(scores: chex.Array, failed: chex.Array) -> Roc:
+def roc(scores: Array, failed: Array) -> Roc:
     """The receiver operating characteristic of scores; equal scores are one point.
 
     Args:
@@ -102,7 +100,7 @@ def roc(scores: chex.Array, failed: chex.Array) -> Roc:
     )
 
 
-def auc(scores: chex.Array, failed: chex.Array) -> float:
+def auc(scores: Array, failed: Array) -> float:
     """Area under the ROC curve: the chance that a failure has the higher score of a random pair;
     equal scores count half.
 
@@ -125,7 +123,7 @@ def auc(scores: chex.Array, failed: chex.Array) -> float:
 
 
 def judge(
-    result: Result, failed: chex.Array, *, threshold: float = 0.5, top: int | None = None
+    result: Result, failed: Array, *, threshold: float = 0.5, top: int | None = None
 ) -> Judgement:
     """How good the scores of each iteration are, by the truth on all inputs.
 

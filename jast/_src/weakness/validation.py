@@ -6,12 +6,13 @@ import json
 import os
 import traceback
 import warnings
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import jax
 import numpy as np
 
 from jast._src.core.counter_prng import numpy_generator
+from jast._src.core.typing import Array, Callback, PathLike, Predict, PRNGKey
 from jast._src.runtime.checkpoints import open_checkpoint
 from jast._src.runtime.progress_bar import Watch, terminable
 from jast._src.util.checks import check_random_key, whole_number
@@ -19,11 +20,6 @@ from jast._src.weakness.data import are_indices, check_data, fingerprint
 from jast._src.weakness.measures import auc
 from jast._src.weakness.result import History, Result, State
 from jast._src.weakness.selector_contract import Seen, Selector
-
-if TYPE_CHECKING:
-    import chex
-
-    from jast._src.core.typing import Callback, PathLike, Predict
 
 __all__ = ["iteration_key", "validate"]
 
@@ -36,10 +32,10 @@ class _NoAnswer(Exception):
 
 
 def validate(
-    key: chex.PRNGKey,
+    key: PRNGKey,
     predict: Predict,
-    inputs: chex.Array,
-    labels: chex.Array,
+    inputs: Array,
+    labels: Array,
     *,
     budget: int | None = None,
     selector: Selector | Literal["default", "random", "thesis"] = "default",

@@ -4,18 +4,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from jast._src.core.signature import signature_of
+from jast._src.core.simulator import Simulator
+from jast._src.estimate.population.descents import Descent
 from jast._src.estimate.proposal_search.mixture_draws import resample
 from jast._src.estimate.weighted_draws import Draws, with_source
 from jast._src.util.pytrees import count_numbers
-
-if TYPE_CHECKING:
-    from jast._src.core.simulator import Simulator
-    from jast._src.estimate.population.descents import Descent
 
 __all__ = [
     "MAX_FAILURES",

@@ -6,12 +6,13 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import jax
 import numpy as np
 
 from jast._src.core.counter_prng import counter_key
+from jast._src.core.simulator import Simulator
+from jast._src.core.typing import Callback, Executor, PathLike, PRNGKey
 from jast._src.estimate.estimate import Estimate
 from jast._src.estimate.population.answer import (
     estimate_from_plain_draws,
@@ -30,12 +31,6 @@ from jast._src.util.checks import check_random_key, whole_number
 from jast._src.util.display import call_settings
 from jast._src.util.intervals import checked_level
 
-if TYPE_CHECKING:
-    import chex
-
-    from jast._src.core.simulator import Simulator
-    from jast._src.core.typing import Callback, Executor, PathLike
-
 __all__ = ["MIN_BUDGET", "by_populations", "episodes_a_second", "population"]
 
 MIN_BUDGET = 20_000
@@ -50,7 +45,7 @@ TIMED_SECONDS = 0.05
 
 
 def population(
-    key: chex.PRNGKey,
+    key: PRNGKey,
     sim: Simulator,
     budget: int = 2_000_000,
     *,

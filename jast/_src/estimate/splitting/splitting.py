@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -13,6 +13,8 @@ import numpy as np
 from jast._src.core.check import contract
 from jast._src.core.float_resolution import rounding_problem
 from jast._src.core.signature import signature_of
+from jast._src.core.simulator import Simulator
+from jast._src.core.typing import Array, Callback, Executor, PathLike, PRNGKey
 from jast._src.estimate.estimate import Estimate, estimate_from_mean
 from jast._src.estimate.population.search import Answer, contradictions
 from jast._src.estimate.replicates import LOST_MODE_REMARK, MIN_REPLICATES, mean_of_replicates
@@ -29,12 +31,6 @@ from jast._src.util.display import call_settings
 from jast._src.util.intervals import checked_level
 from jast._src.util.pytrees import as_partial, shapes_text, traceable
 
-if TYPE_CHECKING:
-    import chex
-
-    from jast._src.core.simulator import Simulator
-    from jast._src.core.typing import Callback, Executor, PathLike
-
 __all__ = ["splitting"]
 
 NAME = "splitting"
@@ -46,12 +42,12 @@ what a run says is what became of a single episode."""
 
 
 def splitting(
-    key: chex.PRNGKey,
+    key: PRNGKey,
     sim: Simulator,
     particles: int = 1000,
     *,
     runs: int = 10,
-    score: Callable[[Any], chex.Array] | None = None,
+    score: Callable[[Any], Array] | None = None,
     level: float = 0.95,
     progress: bool = False,
     callback: Callback | None = None,

@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -23,6 +23,7 @@ from jast._src.core.episode import Episode
 from jast._src.core.rewards import as_pytree
 from jast._src.core.signature import signature_of
 from jast._src.core.simulator import Simulator, require_simulator
+from jast._src.core.typing import Callback, PathLike, PRNGKey
 from jast._src.runtime import memory
 from jast._src.runtime.host_errors import runs_on_host
 from jast._src.search.best_episodes import BestEpisodes, standard_reward
@@ -34,11 +35,6 @@ from jast._src.search.refine.final import SHARE, with_refine_share
 from jast._src.search.result import SearchResult
 from jast._src.util import checks
 from jast._src.util.display import call_settings
-
-if TYPE_CHECKING:
-    import chex
-
-    from jast._src.core.typing import Callback, PathLike
 
 __all__ = ["go_explore"]
 
@@ -68,7 +64,7 @@ class State(NamedTuple):
 
 
 def go_explore(
-    key: chex.PRNGKey,
+    key: PRNGKey,
     sim: Simulator,
     *,
     episodes: int = 100_000,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -13,6 +13,7 @@ from jast._src.core.failures import Failures, collect, empty
 from jast._src.core.rewards import likelihood
 from jast._src.core.signature import signature_of
 from jast._src.core.simulator import Simulator
+from jast._src.core.typing import PathLike, PRNGKey
 from jast._src.normal_space.mode_coordinates import centred
 from jast._src.normal_space.transform import check, normal_of, played, unit
 from jast._src.runtime.checkpoints import keep_answers, open_checkpoint
@@ -23,11 +24,6 @@ from jast._src.search.refine.round import first_points, residuals, round_of
 from jast._src.util import checks, display
 from jast._src.util.display import call_settings
 from jast._src.util.pytrees import count_numbers
-
-if TYPE_CHECKING:
-    import chex
-
-    from jast._src.core.typing import PathLike
 
 __all__ = ["GRADIENT", "Refined", "first_failing_lift", "lift", "refine"]
 
@@ -101,7 +97,7 @@ class Refined(NamedTuple):
 
 
 def refine(
-    key: chex.PRNGKey,
+    key: PRNGKey,
     sim: Simulator,
     failures: Failures | Episode,
     *,

@@ -10,18 +10,16 @@ nothing is designed when it is imported.
 from __future__ import annotations
 
 from functools import partial
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
+from jast._src.core.typing import Numeric
 from jast._src.simulators.arch.f16 import F16, Controls, motion
 from jast._src.simulators.arch.gcas import measured
-
-if TYPE_CHECKING:
-    import chex
 
 __all__ = ["Design", "design", "level", "trim"]
 
@@ -52,7 +50,7 @@ class Design(NamedTuple):
     """[2, 5]: degrees by which beta, p, r and the integrals lower those of aileron and rudder"""
 
 
-def level(speed: chex.Numeric, alpha: chex.Numeric, power: chex.Numeric) -> F16:
+def level(speed: Numeric, alpha: Numeric, power: Numeric) -> F16:
     """The aircraft in level flight at sea level."""
     zero = jnp.zeros(3)
     along = jnp.stack([jnp.cos(alpha), jnp.zeros(()), jnp.sin(alpha)])
@@ -65,7 +63,7 @@ def level(speed: chex.Numeric, alpha: chex.Numeric, power: chex.Numeric) -> F16:
     )
 
 
-def trim(speed: chex.Numeric) -> tuple[jax.Array, Controls]:
+def trim(speed: Numeric) -> tuple[jax.Array, Controls]:
     """Angle of attack (rad) and controls of level flight at ``speed`` (ft/s) and less than military
     power, by Newton's method.
     """

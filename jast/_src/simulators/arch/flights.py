@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jax.tree_util import Partial
 
 from jast._src.core.simulator import Simulator, ravel
+from jast._src.core.typing import Numeric
 from jast._src.simulators.arch import gcas
 from jast._src.simulators.arch.models import Driving, begun, ends, nothing, samples_of
 from jast._src.simulators.arch.specifications import named
@@ -18,9 +19,6 @@ from jast._src.specs.robustness import reach
 from jast._src.util.checks import number
 from jast.distributions import Independent, Uniform
 from jast.specs import Formula, under
-
-if TYPE_CHECKING:
-    import chex
 
 __all__ = ["fly", "ground_collision_avoidance"]
 
@@ -35,7 +33,7 @@ EACH = round(gcas.DURATION / gcas.DT) // STEPS
 
 
 def ground_collision_avoidance(
-    requirement: str | Formula = "F16", altitude: chex.Numeric = 2262.0, start: Any = None
+    requirement: str | Formula = "F16", altitude: Numeric = 2262.0, start: Any = None
 ) -> Simulator:
     """An F-16 dives, and its autopilot levels the wings and pulls up
     (`simulators.arch.gcas` has the autopilot, what of it is our own, and published results;
@@ -81,7 +79,7 @@ def ground_collision_avoidance(
 
 
 def fly(
-    roll: chex.Numeric, pitch: chex.Numeric, yaw: chex.Numeric, altitude: chex.Numeric = 2262.0
+    roll: Numeric, pitch: Numeric, yaw: Numeric, altitude: Numeric = 2262.0
 ) -> tuple[gcas.Flight, float]:
     """One flight of 15 s from a given start, such as a published one.
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from functools import cache
 from types import ModuleType
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -13,15 +13,13 @@ import numpy as np
 from jax.tree_util import Partial
 
 from jast._src.core.simulator import Simulator
+from jast._src.core.typing import Array
 from jast._src.simulators.arch import cars, transmission
 from jast._src.simulators.arch.specifications import named
 from jast._src.specs.robustness import reach
 from jast._src.util.checks import whole_number
 from jast.distributions import Independent, Uniform
 from jast.specs import Formula, under
-
-if TYPE_CHECKING:
-    import chex
 
 __all__ = [
     "Driving",
@@ -117,8 +115,8 @@ def automatic_transmission(
 
 def simulate(
     model: str,
-    times: chex.Array,
-    inputs: chex.Array,
+    times: Array,
+    inputs: Array,
     interpolation: Literal["step", "linear"] = "step",
 ) -> tuple[Any, float]:
     """A model's trace under given inputs, such as published ones.

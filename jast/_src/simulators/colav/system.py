@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -15,6 +15,7 @@ from jax.tree_util import Partial
 
 from jast import distributions as D
 from jast._src.core.simulator import Simulator
+from jast._src.core.typing import Numeric
 from jast._src.runtime._jax import is_traced
 from jast._src.simulators.colav import planner, tracker
 from jast._src.simulators.colav.scenarios import SCENARIOS, Scenario
@@ -29,9 +30,6 @@ from jast._src.simulators.colav.vessels import (
     world_velocity,
 )
 from jast._src.simulators.parameter import positive
-
-if TYPE_CHECKING:
-    import chex
 
 __all__ = ["COLLISION", "ColavState", "colav"]
 
@@ -85,10 +83,10 @@ def colav(
     disturbances: str | Sequence[str] = "delay",
     *,
     substeps: int = 30,
-    longest_delay: chex.Numeric = BUFFER,
-    delay_change: chex.Numeric = 0.2,
-    delay_easing: chex.Numeric = 0.8,
-    steering_change: chex.Numeric = 0.5,
+    longest_delay: Numeric = BUFFER,
+    delay_change: Numeric = 0.2,
+    delay_easing: Numeric = 0.8,
+    steering_change: Numeric = 0.5,
     noise: Sequence[float] = (0.3, 0.1),
 ) -> Simulator:
     """A ferry with collision avoidance meets an adversary: a `Simulator` of 25 to 27 steps of 3 s,

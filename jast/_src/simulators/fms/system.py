@@ -5,7 +5,7 @@ distances for users and pictures.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -14,17 +14,13 @@ from jax.tree_util import Partial
 from jast import distributions as D
 from jast._src.core.episode import Episode, replay
 from jast._src.core.simulator import Simulator
+from jast._src.core.typing import Numeric
 from jast._src.simulators.fms import events
 from jast._src.simulators.fms.database import APART, KLAX, KSFO, POSITIONS
+from jast._src.simulators.fms.events import Misses
 from jast._src.simulators.fms.geodesic import EARTHS, Earth, direct
-from jast._src.simulators.fms.lateral import KNOT, NMI, Build, lateral
+from jast._src.simulators.fms.lateral import KNOT, NMI, Build, Path, lateral
 from jast._src.util.checks import real_number, whole_number
-
-if TYPE_CHECKING:
-    import chex
-
-    from jast._src.simulators.fms.events import Misses
-    from jast._src.simulators.fms.lateral import Path
 
 __all__ = ["MEANS", "SIGMAS", "FmsState", "fms", "fms_misses", "fms_path"]
 
@@ -59,9 +55,9 @@ class Model:
 
 
 def fms(
-    eps: chex.Numeric = 0.03,
-    bank: chex.Numeric = 23.3,
-    tas: chex.Numeric = 450.0,
+    eps: Numeric = 0.03,
+    bank: Numeric = 23.3,
+    tas: Numeric = 450.0,
     waypoints: int = 12,
     guard: Literal["s-turns", "all"] = "s-turns",
     event: Literal["arc length", "kink", "disconnection", "course"] = "arc length",
