@@ -12,7 +12,7 @@ nbclient = pytest.importorskip("nbclient")
 
 ROOT = Path(__file__).parents[1]
 NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
-NEEDS = {"trained_policy": "gymnax"}  # of the extra `systems`
+NEEDS = {"slow_simulator": "highway_env", "trained_policy": "gymnax"}  # of the extra `systems`
 
 
 def test_there_are_notebooks():

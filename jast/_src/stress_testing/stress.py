@@ -502,6 +502,8 @@ class _StressTest:
         runs = failing_runs(self.sim)[self.known :]
         if runs:
             found = collect(self.sim, self.reward, failing_episodes(self.sim, runs), top=self.top)
+            if _best_log_density(found) > _best_log_density(self.failures):
+                self.residual = self.late = np.nan  # those of another failure
             self.failures = merge(self.failures, found, top=self.top)
             self.note("failing runs kept", 0)
 
