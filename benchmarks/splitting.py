@@ -145,13 +145,13 @@ def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
     )
 
 
-def main() -> None:
+def main(argv: list[str] | None = None) -> None:
     parser = options(__doc__, "4 keys, without plain draws")
     parser.add_argument("--keys", type=int, help="default: 16; 4 with --quick, 1 with --smoke")
     parser.add_argument("--particles", type=int, help="of a run; default: by the system")
     add_choices(parser, "--systems", SYSTEMS)
     add_choices(parser, "--methods", METHODS, "all but failure_probability and pytams")
-    args = parser.parse_args()
+    args = parser.parse_args(argv)
     say, report = printer(args), {}
     keys = args.keys or size(args, 16, 4, 1)
     for name in args.systems or size(args, list(SYSTEMS), list(SYSTEMS), ["toy"]):

@@ -86,7 +86,7 @@ def test_failures_given_lead_and_are_not_counted(key):
     sim = ruin(goal=15, horizon=60)
     one = archive(sim, np.ones(60))
     many = one._replace(episodes=jax.tree.map(lambda a: np.repeat(a, 50, axis=0), one.episodes))
-    with_it, without = (failure_probability(key, sim, 8000, failures=f) for f in (many, None))
+    with_it, without = (failure_probability(key, sim, 12_000, failures=f) for f in (many, None))
     check_estimate(with_it, ruin_probability(0.4, 1, 15, 60))
     a, b = with_it.draws, without.draws
     assert a.samples == b.samples - 50

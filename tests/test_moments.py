@@ -94,7 +94,7 @@ def test_the_lane_is_answered_with_two_thousand_runs(dtype):
 def test_a_black_box_runs_as_often_as_it_says():
     SlowLane.runs = 0
     p = failure_probability(jax.random.key(0), slow_lane(), 1500)
-    assert SlowLane.runs == p.evaluations == 1500
+    assert 1490 < SlowLane.runs <= p.evaluations == 1500  # what is known is not run again
     assert p.reliable and abs(p.mean / 5.0355e-5 - 1) < 4 * p.relative_error < 0.5
 
 

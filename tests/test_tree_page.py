@@ -61,7 +61,7 @@ def test_what_is_kept_is_the_tree(name, found):
             assert nodes.visits[n] == 1 + nodes.visits[nodes.children(n)].sum()
         assert nodes.failing[0] == (trees.failure & (trees.visits > 0))[:, lane].sum()
     archive, seen = result.failures, 0
-    start = jast._src.core.signature.outline(sim).random_start
+    start = jast._src.core.signature.signature_of(sim).random_start
     for i, episode in enumerate(archive):
         lane, simulation = int(archive.tree[i]), int(archive.simulation[i])
         if lane < 0:

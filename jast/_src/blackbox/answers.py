@@ -65,6 +65,12 @@ class Answers:
             del kept[next(iter(kept))]
         kept[key] = answer
 
+    def add(self, others: Answers) -> None:
+        """Those of ``others``, too."""
+        for key, answer in (*others.others.items(), *others.failing.items()):
+            self.put(key, answer)
+        self.failures.extend(others.failures)
+
     def put_part(self, part: list[np.ndarray], starts: int) -> None:
         """The answers and failures of a part of a checkpoint (`part_of`)."""
         keys, event, distance, terminal, log_p, seen, *_ = part

@@ -102,6 +102,17 @@ class Host:
             self.store = before
 
     @contextlib.contextmanager
+    def runs_apart(self):
+        """A context that knows no answer from before it; after it both are known."""
+        before, self.answers = self.answers, Answers(self.size)
+        try:
+            yield
+        finally:
+            with self.lock:
+                before.add(self.answers)
+                self.answers = before
+
+    @contextlib.contextmanager
     def tell_runs(self, told):
         """A context in which ``told(failing)`` is called after each batch of runs, with the number
         of failing ones in it.

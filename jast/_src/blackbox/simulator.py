@@ -307,6 +307,7 @@ class _Asking:
         self.incidents, self.calls = host.incidents, host.calls
         self.failing, self.workers = host.failing, host.workers
         self.keep_runs, self.tell_runs = host.keep_runs, host.tell_runs
+        self.runs_apart = host.runs_apart
         if host.spec.episodic and not host.spec.run:
             self.compare = partial(compare, host)
         if not host.spec.episodic:

@@ -196,8 +196,12 @@ def _signature(method: str) -> inspect.Signature:
     """
     whole = inspect.signature(ce_method)
     own = dict(whole.parameters)
-    for name in MODES[method]["default"]:
-        own.setdefault(name, inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=None))
+    for name, value in MODES[method]["default"].items():
+        kind = "float | str" if name == "selection" else type(value).__name__
+        setting = inspect.Parameter(
+            name, inspect.Parameter.KEYWORD_ONLY, default=None, annotation=f"{kind} | None"
+        )
+        own.setdefault(name, setting)
     return whole.replace(parameters=list(own.values()))
 
 

@@ -23,6 +23,7 @@ __all__ = [
     "incidents",
     "merge_incidents",
     "new_incidents",
+    "runs_apart",
     "runs_made",
     "runs_on_host",
     "sources",
@@ -145,6 +146,17 @@ def runs_made(sim):
 def failing_runs(sim):
     """The runs of a black box that failed so far, each once, as its workplace keeps them."""
     return [run for source in sources(sim, "failing") for run in source.failing()]
+
+
+@contextlib.contextmanager
+def runs_apart(sim):
+    """A context in which a black box does not know the answers from before; after it, it knows
+    both.
+    """
+    with contextlib.ExitStack() as stack:
+        for source in sources(sim, "runs_apart"):
+            stack.enter_context(source.runs_apart())
+        yield
 
 
 @contextlib.contextmanager

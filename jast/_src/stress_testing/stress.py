@@ -35,7 +35,13 @@ from jast._src.normal_space import transform
 from jast._src.runtime import work
 from jast._src.runtime._jax import briefly
 from jast._src.runtime.checkpoints import keep_answers, open_checkpoint
-from jast._src.runtime.host_errors import failing_runs, runs_made, runs_on_host, telling_runs
+from jast._src.runtime.host_errors import (
+    failing_runs,
+    runs_apart,
+    runs_made,
+    runs_on_host,
+    telling_runs,
+)
 from jast._src.runtime.progress_bar import Watch
 from jast._src.search.refine.modes import Mode, Modes, modes, spread
 from jast._src.search.refine.refine import refine
@@ -90,6 +96,9 @@ the crossing, the cart-pole and the ship failures are as likely with half as man
 coolings, which cost a tenth of the CPU time."""
 POOL_FACTOR = 32
 """Failures in the pool for each that is returned: modes are told apart among these."""
+HOSTED_EXTRA = 14
+"""Runs of a black box that no other piece of the work counts: of `check` 10, the undisturbed
+episode and its proof, and two that are made again to see whether they are answered the same."""
 LAST_SHARE = 0.15
 """Share of the budget that a black box keeps for the probability, whatever came before."""
 FALSIFY_SHARE = 0.2
@@ -193,14 +202,27 @@ def stress(
         budget = checks.whole_number(name, "budget", budget, MIN_BUDGET)
     top = checks.whole_number(name, "top", top, 1)
     require_simulator(name, sim)
-    begun = runs_made(sim), len(failing_runs(sim))
+    with runs_apart(sim):  # so that the same call is the same, whatever ran before
+        return _stress(
+            *(name, key, sim, budget, seconds, top),
+            progress=progress,
+            callback=callback,
+            checkpoint=checkpoint,
+            executor=executor,
+            devices=devices,
+        )
+
+
+def _stress(
+    name, key, sim, budget, seconds, top, *, progress, callback, checkpoint, executor, devices
+):
+    """The `Report` of arguments that were checked."""
     check(sim)
     by_default = budget is None and seconds is None and checkpoint is None
     if budget is None and seconds is None and not has_quantiles(sim):
         budget = DEFAULT_BUDGET
     if budget is None:
         budget = budgets.measure_budget(name, key, sim, seconds, MIN_BUDGET, DEFAULT_BUDGET)
-        begun = runs_made(sim), begun[1]
     settings = call_settings(name, key, budget=budget, top=top)
     ways = work.placement(name, executor, devices)
     with (
@@ -212,8 +234,7 @@ def stress(
         ways = ways._replace(store=store)
         test = _StressTest(key, sim, budget, top=top, watch=watch, ways=ways, checkpoint=checkpoint)
         if test.hosted:
-            test.made, test.known = begun
-            test.note("check", 0)
+            test.note("check", HOSTED_EXTRA)
         try:
             with telling_runs(sim, test.tell_runs):
                 test.run_nominal()
@@ -255,8 +276,7 @@ class _StressTest:
         self.residual = self.late = np.nan
         self.has_points = has_quantiles(sim)
         large = (1 - sum(LARGE_SHARES)) * budget >= MIN_ESTIMATE_BUDGET
-        self.hosted, self.made, self.known = runs_on_host(sim), 0, 0
-        self.failing_runs = 0
+        self.hosted, self.failing_runs = runs_on_host(sim), 0
         self.cheap = self.has_points and budgets.uses_populations(sim, budget)
         shares = COUNTING_SHARES
         if self.has_points:
@@ -274,11 +294,7 @@ class _StressTest:
         return key
 
     def note(self, name, evaluations, failing=0, best=-np.inf, invalid=0):
-        """Count a piece of the work; of a black box, what it ran in this process."""
-        if self.hosted:
-            self.made, before = runs_made(self.sim), self.made
-            if self.ways.executor is None:
-                evaluations = self.made - before
+        """Count a piece of the work."""
         self.tried.append(Tried(name, int(evaluations), int(failing), float(best)))
         self.spent += int(evaluations)
         self.invalid += int(invalid)
@@ -288,8 +304,7 @@ class _StressTest:
     def tell_runs(self, failing: int) -> None:
         """The bar moves with every batch of runs of a black box."""
         self.failing_runs += failing
-        done = self.spent + runs_made(self.sim) - self.made
-        self.watch.reach(min(done, self.budget), failures=self.failing_runs)
+        self.watch.reach(min(runs_made(self.sim), self.budget), failures=self.failing_runs)
 
     def affordable(self, evaluations: int) -> int:
         """``evaluations``, of a black box at most those that it may still run before its
@@ -499,7 +514,7 @@ class _StressTest:
 
     def keep_failing_runs(self):
         """Every failing run of a black box joins what the report shows, whoever made it."""
-        runs = failing_runs(self.sim)[self.known :]
+        runs = failing_runs(self.sim)
         if runs:
             found = collect(self.sim, self.reward, failing_episodes(self.sim, runs), top=self.top)
             if _best_log_density(found) > _best_log_density(self.failures):
