@@ -156,7 +156,8 @@ def test_a_search_runs_its_episodes_and_those_that_scale_it(key, name, kind):
 def test_stress_runs_its_budget_with_all_that_it_does(key, kind, budget):
     sim = box(kind)
     report = jast.stress(key, sim, budget)
-    assert Counted.runs == report.episodes <= budget
+    # the parts of the work state what they need, never less than they run
+    assert 0.9 * budget < Counted.runs <= report.episodes <= budget
     assert report.episodes == sum(report.spent.values())
     assert "falsify" in report.spent and report.failures.best.failure
     assert report.probability is not None
