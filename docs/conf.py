@@ -2,6 +2,8 @@
 
 import re
 
+from sphinx.util.inspect import TypeAliasForwardRef
+
 import jast
 
 project, author, copyright = "jast", "the authors of jast", "the authors of jast"
@@ -28,6 +30,8 @@ default_role = "py:obj"
 suppress_warnings = ["ref.python"]  # a word in backticks may be the name of several fields
 autodoc_member_order = "bysource"
 autodoc_typehints_format = "short"
+TypeAliasForwardRef.__repr__ = lambda self: self.name  # also in unions
+autodoc_type_aliases = {name: name for name in ("Array", "ArrayTree", "Numeric", "PRNGKey")}
 python_maximum_signature_line_length = 90
 napoleon_numpy_docstring = False
 
