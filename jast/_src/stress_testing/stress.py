@@ -202,21 +202,6 @@ def stress(
         budget = checks.whole_number(name, "budget", budget, MIN_BUDGET)
     top = checks.whole_number(name, "top", top, 1)
     require_simulator(name, sim)
-    with runs_apart(sim):  # so that the same call is the same, whatever ran before
-        return _stress(
-            *(name, key, sim, budget, seconds, top),
-            progress=progress,
-            callback=callback,
-            checkpoint=checkpoint,
-            executor=executor,
-            devices=devices,
-        )
-
-
-def _stress(
-    name, key, sim, budget, seconds, top, *, progress, callback, checkpoint, executor, devices
-):
-    """The `Report` of arguments that were checked."""
     check(sim)
     by_default = budget is None and seconds is None and checkpoint is None
     if budget is None and seconds is None and not has_quantiles(sim):
@@ -226,6 +211,7 @@ def _stress(
     settings = call_settings(name, key, budget=budget, top=top)
     ways = work.placement(name, executor, devices)
     with (
+        runs_apart(sim),  # so that the same call is the same, whatever ran before
         open_checkpoint(name, checkpoint, key, sim=sim, budget=budget, top=top) as store,
         keep_answers(store),
         briefly(not budgets.uses_populations(sim, budget)),
@@ -248,7 +234,7 @@ def _stress(
             if test.nominal is None:
                 raise
             settings["interrupted"] = f"after {test.spent} of {budget} evaluations"
-    report = test.report(settings)
+        report = test.report(settings)
     if by_default and test.cheap and "interrupted" not in settings:
         more = budgets.next_budget(report.probability, budget)
         if more is not None:
@@ -276,7 +262,7 @@ class _StressTest:
         self.residual = self.late = np.nan
         self.has_points = has_quantiles(sim)
         large = (1 - sum(LARGE_SHARES)) * budget >= MIN_ESTIMATE_BUDGET
-        self.hosted, self.failing_runs = runs_on_host(sim), 0
+        self.hosted, self.made, self.failing_runs = runs_on_host(sim), runs_made(sim), 0
         self.cheap = self.has_points and budgets.uses_populations(sim, budget)
         shares = COUNTING_SHARES
         if self.has_points:
@@ -295,6 +281,7 @@ class _StressTest:
 
     def note(self, name, evaluations, failing=0, best=-np.inf, invalid=0):
         """Count a piece of the work."""
+        self.made = runs_made(self.sim)
         self.tried.append(Tried(name, int(evaluations), int(failing), float(best)))
         self.spent += int(evaluations)
         self.invalid += int(invalid)
@@ -304,7 +291,8 @@ class _StressTest:
     def tell_runs(self, failing: int) -> None:
         """The bar moves with every batch of runs of a black box."""
         self.failing_runs += failing
-        self.watch.reach(min(runs_made(self.sim), self.budget), failures=self.failing_runs)
+        done = self.spent + runs_made(self.sim) - self.made
+        self.watch.reach(min(done, self.budget), failures=self.failing_runs)
 
     def affordable(self, evaluations: int) -> int:
         """``evaluations``, of a black box at most those that it may still run before its
