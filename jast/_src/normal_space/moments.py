@@ -11,15 +11,12 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
 
-from jast import distributions as D
-from jast._src.core.rewards import likelihood
+from jast._src.core.signature import signature_of
 from jast._src.core.simulator import Simulator
-from jast._src.core.transition import advance, begin, conclude
 from jast._src.normal_space.design_point_descent import differentiable
 from jast._src.normal_space.evaluate_points import evaluate_points
-from jast._src.normal_space.transform import Outcomes, outcomes_of, policy_of
+from jast._src.normal_space.transform import Outcomes, outcomes_of, simulate
 from jast._src.runtime._jax import quick
 from jast._src.runtime.checkpoints import answer_once
 
@@ -51,25 +48,16 @@ def distances(sim: Simulator, z: np.ndarray) -> tuple[Outcomes, np.ndarray]:
 
 def _play(sim: Simulator, z: jax.Array) -> tuple[Outcomes, jax.Array]:
     """`distances` of the one episode of ``z`` [D]."""
-    policy, last, reward = policy_of(sim, z), jnp.asarray(sim.horizon, jnp.int32), likelihood(sim)
 
-    def safe(progress):
-        return jnp.where(progress.failure, jnp.nan, sim.evaluate(progress.state)[1])
+    def see(progress, t, g):
+        return g.at[t].set(jnp.where(progress.failure, jnp.nan, sim.evaluate(progress.state)[1]))
 
-    def body(carry):
-        progress, t, g = carry
-        x = D.mode(policy.disturbance(progress.state, t))
-        new = advance(sim, reward, progress, x, t + 1 >= last)
-        return new, t + 1, g if sim.episodic else g.at[t + 1].set(safe(new))
-
-    begun = begin(sim, reward, D.mode(policy.start()))
-    nothing = jnp.full(1 if sim.episodic else sim.horizon + 1, jnp.nan, begun.distance.dtype)
-    first = nothing if sim.episodic else nothing.at[0].set(safe(begun))
-    carry = begun, jnp.zeros((), jnp.int32), first
-    end, length, g = lax.while_loop(lambda c: ~c[0].done, body, carry)
-    end = conclude(sim, reward, end)
     if sim.episodic:
+        end, length, _ = simulate(sim, z)
         g = jnp.where(end.failure, jnp.nan, end.distance)[None]
+    else:
+        nothing = jnp.full(sim.horizon + 1, jnp.nan, signature_of(sim).dtype)
+        end, length, g = simulate(sim, z, nothing, see)
     return outcomes_of(sim, end, length), g
 
 

@@ -56,6 +56,7 @@ __all__ = [
     "played",
     "policy_of",
     "side_by_side",
+    "simulate",
     "split_point",
     "used_numbers",
     "unit",
@@ -146,31 +147,28 @@ def normal_numbers(sim: Simulator) -> Any:
     )
 
 
-def _simulate(
-    sim: Simulator, z: jax.Array, reward: Callable, level: Any = None
-) -> tuple[Progress, jax.Array, jax.Array | None]:
-    """The `Progress` at the end of the one episode of ``z`` [D], its steps, and of a ``level`` the
-    steps before the episode failed or its distance first came to it; differentiable in forward
+def simulate(
+    sim: Simulator, z: jax.Array, seen: Any = None, see: Callable | None = None
+) -> tuple[Progress, jax.Array, Any]:
+    """The `Progress` at the end of the one episode of ``z`` [D], its steps, and what is ``seen`` by
+    then: ``see(progress, t, seen)`` is asked at each state s_0 .. s_T. Differentiable in forward
     mode.
     """
-    policy, last = policy_of(sim, z), jnp.asarray(sim.horizon, jnp.int32)
-    begun = begin(sim, reward, D.mode(policy.start()))
+    policy, last, reward = policy_of(sim, z), jnp.asarray(sim.horizon, jnp.int32), likelihood(sim)
 
-    def waited(p, steps):
-        if level is None:
-            return None
-        return steps + (~p.failure & (p.distance > level)).astype(steps.dtype)
+    def look(progress, t, seen):
+        return seen if see is None else see(progress, t, seen)
 
     def body(carry):
-        progress, t, steps = carry
+        progress, t, seen = carry
         x = D.mode(policy.disturbance(progress.state, t))
         new = advance(sim, reward, progress, x, t + 1 >= last)
-        return new, t + 1, waited(new, steps)
+        return new, t + 1, look(new, t + 1, seen)
 
-    none = jnp.zeros((), jnp.int32)
-    start = begun, none, waited(begun, none)
-    end, length, steps = lax.while_loop(lambda c: ~c[0].done, body, start)
-    return conclude(sim, reward, end), length, steps
+    begun, none = begin(sim, reward, D.mode(policy.start())), jnp.zeros((), jnp.int32)
+    start = begun, none, look(begun, none, seen)
+    end, length, seen = lax.while_loop(lambda c: ~c[0].done, body, start)
+    return conclude(sim, reward, end), length, seen
 
 
 def unit(z: np.ndarray) -> np.ndarray:
@@ -180,7 +178,7 @@ def unit(z: np.ndarray) -> np.ndarray:
 
 def outcome(sim: Simulator, z: jax.Array) -> Outcomes:
     """`Outcomes` of the one episode of ``z`` [D], differentiable in forward mode."""
-    end, length, _ = _simulate(sim, z, likelihood(sim))
+    end, length, _ = simulate(sim, z)
     return outcomes_of(sim, end, length)
 
 
@@ -188,7 +186,11 @@ def outcome_by_level(sim: Simulator, z: jax.Array, level: Any) -> tuple[Outcomes
     """The same, and how many of the numbers were used when the episode failed or its distance first
     came to the ``level``.
     """
-    end, length, steps = _simulate(sim, z, likelihood(sim), level)
+
+    def wait(progress, t, steps):
+        return steps + (~progress.failure & (progress.distance > level)).astype(steps.dtype)
+
+    end, length, steps = simulate(sim, z, jnp.zeros((), jnp.int32), wait)
     return outcomes_of(sim, end, length)._replace(log_p=None), used_numbers(sim, steps)
 
 
