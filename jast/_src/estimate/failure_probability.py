@@ -185,7 +185,7 @@ def failure_probability(
             budget = budgets.measure_budget(name, key, sim, seconds, few_calls.LEAST)
     settings = call_settings(name, key, budget=budget, gradients=bool(gradients), level=level)
     known = None if failures is None else transform.normal_of(sim, failures.episodes)
-    ways, watched = work.placement(name, executor, devices), (progress, callback)
+    placement, watched = work.placement(name, executor, devices), (progress, callback)
     about = dict(sim=sim, budget=budget, gradients=bool(gradients), known=known, near=similar)
     few = not budgets.uses_populations(sim, budget)
     with (
@@ -193,15 +193,17 @@ def failure_probability(
         keep_answers(store),
         briefly(few),
     ):
-        ways = ways._replace(store=store)
+        placement = placement._replace(store=store)
         if not (guided or few):
-            found = by_populations(name, key, sim, budget, level=level, watched=watched, ways=ways)
+            found = by_populations(
+                name, key, sim, budget, level=level, watched=watched, placement=placement
+            )
         elif budget < MIN_BUDGET and transform.dimension(sim) <= MAX_SURROGATE_NUMBERS:
             found = few_calls.few_calls(key, sim, budget, level, known, progress, callback)
         else:
             # tilts may have spent half, and populations know nothing of failures given
             serve = not (guided or runs_on_host(sim)) and budget >= 2 * POPULATIONS_LEAST
-            about = dict(level=level, watched=watched, ways=ways)
+            about = dict(level=level, watched=watched, placement=placement)
             wanted = Request(
                 name=name,
                 key=key,
@@ -213,7 +215,7 @@ def failure_probability(
                 near=similar,
                 level=level,
                 watched=watched,
-                ways=ways,
+                placement=placement,
                 otherwise=partial(by_populations, name, key, sim, **about) if serve else None,
             )
             found = estimate_by_proposal(wanted)

@@ -93,12 +93,12 @@ def monte_carlo(
     by_points = signature_of(sim).closed
     simulate = simulate_points if by_points else _simulate_keys
     lanes = lanes_of_points(sim) if by_points else CHUNK_EPISODES
-    ways = work.placement(name, executor, devices)
+    placement = work.placement(name, executor, devices)
     with open_checkpoint(name, checkpoint, key, sim=sim, samples=samples) as store:
         watch = Watch(name, samples, "episode", progress, callback)
         shared = key, sim, lanes, samples
-        ways = ways._replace(store=store)
-        total, notes, reasons = chunks(simulate, shared, lanes, watch, ways)
+        placement = placement._replace(store=store)
+        total, notes, reasons = chunks(simulate, shared, lanes, watch, placement)
     settings = call_settings(name, key, samples=samples, level=level)
     found = estimate_from_counts(name, total, level=level, notes=notes, reasons=reasons)
     draws = with_source(found.draws, key, lanes, "model" if by_points else "keys")

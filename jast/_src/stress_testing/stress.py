@@ -209,7 +209,7 @@ def stress(
     if budget is None:
         budget = budgets.measure_budget(name, key, sim, seconds, MIN_BUDGET, DEFAULT_BUDGET)
     settings = call_settings(name, key, budget=budget, top=top)
-    ways = work.placement(name, executor, devices)
+    placement = work.placement(name, executor, devices)
     with (
         runs_apart(sim),  # so that the same call is the same, whatever ran before
         open_checkpoint(name, checkpoint, key, sim=sim, budget=budget, top=top) as store,
@@ -217,8 +217,10 @@ def stress(
         briefly(not budgets.uses_populations(sim, budget)),
         Watch(name, budget, "sim", progress, callback) as watch,
     ):
-        ways = ways._replace(store=store)
-        test = _StressTest(key, sim, budget, top=top, watch=watch, ways=ways, checkpoint=checkpoint)
+        placement = placement._replace(store=store)
+        test = _StressTest(
+            key, sim, budget, top=top, watch=watch, placement=placement, checkpoint=checkpoint
+        )
         if test.hosted:
             test.note("check", HOSTED_EXTRA)
         try:
@@ -250,10 +252,10 @@ class _StressTest:
     ``failures`` what the report shows.
     """
 
-    def __init__(self, key, sim, budget, top, watch, ways, checkpoint):
+    def __init__(self, key, sim, budget, top, watch, placement, checkpoint):
         self.key, self.sim = key, sim
         self.budget, self.top = budget, top
-        self.watch, self.ways = watch, ways
+        self.watch, self.placement = watch, placement
         self.checkpoint, self.reward = checkpoint, likelihood(sim)
         self.nominal = self.probability = None
         self.pool = self.failures = self.refined = empty(sim)
@@ -329,7 +331,7 @@ class _StressTest:
         rest = self.budget - self.spent - cooling - 2 * refining
         rest = max(rest, MIN_POPULATION_BUDGET // 2)
         self.watch.doing("estimating")
-        p = by_populations("stress", self.next_key(), self.sim, rest, ways=self.ways)
+        p = by_populations("stress", self.next_key(), self.sim, rest, placement=self.placement)
         self.keep_probability(p, "populations")
         sample = p.proposal
         if not isinstance(sample, Sample):
@@ -470,7 +472,9 @@ class _StressTest:
         self.watch.doing("estimating")
         rest = max(self.budget - self.spent, 1)
         folder = None if self.checkpoint is None else Path(self.checkpoint) / "probability"
-        places = dict(executor=self.ways.executor, devices=self.ways.devices, checkpoint=folder)
+        places = dict(
+            executor=self.placement.executor, devices=self.placement.devices, checkpoint=folder
+        )
         if not self.has_points or self.hosted and rest < few_calls.LEAST:
             n = rest if self.hosted else max(rest, MIN_COUNTED_EPISODES)
             p = monte_carlo(self.next_key(), self.sim, n, **places)

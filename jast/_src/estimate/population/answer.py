@@ -78,9 +78,12 @@ def estimate_from_plain_draws(search: PopulationSearch, name: str, level: float)
     lanes = lanes_of_points(search.sim)
     if n > 0 and not search.interrupted:
         watch = Watch(name, n, "episode", False, None)
-        shared, ways = (search.key, search.sim, lanes, n), search.ways._replace(name="plain")
+        shared, placement = (
+            (search.key, search.sim, lanes, n),
+            search.placement._replace(name="plain"),
+        )
         try:
-            total, notes, reasons = chunks(simulate_points, shared, lanes, watch, ways)
+            total, notes, reasons = chunks(simulate_points, shared, lanes, watch, placement)
             search.reasons += reasons
             search.spent += total.samples
             search.interrupted = " ".join(notes)

@@ -120,7 +120,9 @@ def _draw_estimate(search, name, said, key, proposal, level):
     interruption left none.
     """
     watch = Watch(name, proposal.draws, "episode", False, None)
-    ways = search.ways._replace(name=said.replace(" ", "-"))  # each has a checkpoint of its own
+    placement = search.placement._replace(
+        name=said.replace(" ", "-")
+    )  # each has a checkpoint of its own
     try:
         found = draw_estimate(
             key,
@@ -128,7 +130,7 @@ def _draw_estimate(search, name, said, key, proposal, level):
             proposal.q,
             chunk_size(proposal.draws),
             watch,
-            ways,
+            placement,
             spent=search.spent,
             reasons=(),
             drawn=int(search.plain[2]),

@@ -131,7 +131,7 @@ def population(
             particles=particles,
             level=level,
             watched=(progress, callback),
-            ways=placement._replace(store=store),
+            placement=placement._replace(store=store),
         )
     return found._replace(settings=call_settings(name, key, budget=budget, level=level))
 
@@ -165,7 +165,7 @@ def by_populations(
     particles: int = SETTINGS.particles,
     level: float = 0.95,
     watched: tuple = (False, None),
-    ways: work.Placement = work.HERE,
+    placement: work.Placement = work.HERE,
 ) -> Estimate:
     """The `Estimate` of `population`, for the function of this ``name``."""
     capacity = population_size(sim, particles)
@@ -173,7 +173,9 @@ def by_populations(
     numbers = capacity * transform.dimension(sim) * np.dtype(transform.normal_numbers(sim)).itemsize
     require(name, 4 * numbers, f"populations of {capacity} points", "use fewer particles")
     with Watch(name, budget, "episode", *watched) as watch:
-        search = PopulationSearch(key, sim, budget, n=n, capacity=capacity, watch=watch, ways=ways)
+        search = PopulationSearch(
+            key, sim, budget, n=n, capacity=capacity, watch=watch, placement=placement
+        )
         search.run(search.first_kind("distance"), 1)
         plain = search.plain_is_best()
         if not plain and not search.interrupted:

@@ -83,10 +83,10 @@ class PopulationSearch:
     compiled program takes ``capacity``.
     """
 
-    def __init__(self, key, sim, budget, n, capacity, watch, ways):
+    def __init__(self, key, sim, budget, n, capacity, watch, placement):
         self.key, self.sim = key, sim
         self.n, self.capacity = n, capacity
-        self.watch, self.ways = watch, ways
+        self.watch, self.placement = watch, placement
         self.runs: dict[Kind, tuple[Descent, ...]] = {}
         self.budget, self.spent = budget, 0
         self.invalid, self.plain = 0, np.zeros(3, np.int64)
@@ -104,7 +104,7 @@ class PopulationSearch:
         most = math.inf if before else WITNESS_SHARE * self.budget / 2
         shared = self.key, self.sim, kind, n, self.capacity, len(before), most
         task = Task(_run_population, shared, lambda: Descent(*Descent._fields))
-        ways = self.ways._replace(name=f"{kind.way}-{kind.moves}-{len(before)}")
+        placement = self.placement._replace(name=f"{kind.way}-{kind.moves}-{len(before)}")
         cost, done = before[-1].evaluations if before else 0, self.spent
         try:
             ran = units.run(
@@ -113,7 +113,7 @@ class PopulationSearch:
                 lambda runs, number, run: (*runs, run),
                 (),
                 self.watch,
-                ways,
+                placement,
                 size=lambda units: min(int(done + units * cost), self.budget),
             )
         except KeyboardInterrupt:

@@ -72,7 +72,7 @@ class Request(NamedTuple):
     level: float = 0.95
     watched: tuple[bool, Callback | None] = (False, None)
     """progress and callback"""
-    ways: Placement = HERE
+    placement: Placement = HERE
     settings: SearchSettings = SETTINGS
     otherwise: Callable[[int], Estimate] | None = None
     """What answers with so many evaluations, in the place of Gaussians, where a system has many
@@ -286,7 +286,7 @@ def _draw(request, search, reasons):
         against = about_proposal if search.suffices else [*about_proposal, UNUSABLE]
         return _draw_proposal(request, search, watch, against)
     shared = key, sim, f.batch, n
-    total, notes, lost = chunks(simulate_points, shared, f.batch, watch, request.ways)
+    total, notes, lost = chunks(simulate_points, shared, f.batch, watch, request.placement)
     found = estimate_from_counts(
         name,
         total,
@@ -311,7 +311,7 @@ def _draw_proposal(request, search, watch, reasons):
         f.with_model(state.q, float(share)),
         f.batch,
         watch,
-        request.ways,
+        request.placement,
         spent=state.spent,
         reasons=reasons,
         share=float(share),

@@ -34,7 +34,7 @@ def draw_estimate(
     q: transform.Latent | Tilts,
     lanes: int,
     watch: Watch,
-    ways: Placement,
+    placement: Placement,
     *,
     spent: int,
     reasons: Sequence[str],
@@ -53,7 +53,7 @@ def draw_estimate(
         return model[transform.component(q, numbers)]
 
     shared = key, sim, q, _members(modes, len(model)), lanes, watch.total
-    total, notes, lost = chunks(_traces, shared, lanes, watch, ways, plain)
+    total, notes, lost = chunks(_traces, shared, lanes, watch, placement, plain)
     central = [i for i, mode in enumerate(modes) if at_model[mode].all()]
     found = estimate_from_weights(
         watch.name,

@@ -126,7 +126,7 @@ def splitting(
     _check_states(sim, score)
     if objects is None:
         require_paths(NAME, sim, particles)
-    ways = work.placement(NAME, executor, devices)
+    placement = work.placement(NAME, executor, devices)
     about = dict(sim=sim, particles=particles, runs=runs, score=score)
     with (
         open_checkpoint(NAME, checkpoint, key, **about) as store,
@@ -135,8 +135,8 @@ def splitting(
         checked = 0 if objects is None else check_objects(NAME, key, sim, objects)
         shared = jax.random.split(key, runs), sim, score, particles
         task = Task(_run, shared, lambda: Run(*Run._fields))
-        ways = ways._replace(store=store)
-        ran = work.run(task, runs, lambda all, i, run: (*all, run), (), watch, ways)
+        placement = placement._replace(store=store)
+        ran = work.run(task, runs, lambda all, i, run: (*all, run), (), watch, placement)
     short = work.describe_missing("runs", ran, len(ran.state), runs)
     if len(ran.state) < MIN_REPLICATES:
         raise KeyboardInterrupt if ran.ended == "" else RuntimeError(f"{NAME}: {short}")

@@ -265,7 +265,7 @@ def with_heads(
 
 
 def grow_rounds(
-    job: Job, key: jax.Array, threads: int, lanes: int, watch: Watch, ways: work.Placement
+    job: Job, key: jax.Array, threads: int, lanes: int, watch: Watch, placement: work.Placement
 ) -> tuple[work.UnitsRun, HeadTraining | None]:
     """Grow all trees, a round at a time, and teach the heads between two rounds.
 
@@ -275,7 +275,7 @@ def grow_rounds(
         threads: that trees grow in.
         lanes: trees side by side in each of them.
         watch: is told of the simulations.
-        ways: how groups of trees are run.
+        placement: how groups of trees are run.
 
     Returns:
         `runtime.work.UnitsRun` with the batches in the order of the trees, and the heads as they
@@ -289,7 +289,7 @@ def grow_rounds(
         own = words[first : first + job.at_once]
         turn = Round(problem, own, job.plan, lanes, chunk, max(256, 4 * job.top), first)
         try:
-            new = grow_all(turn, watch, ways, threads)
+            new = grow_all(turn, watch, placement, threads)
             ran = work.concatenate(ran, new)
             if new.ended is not None:
                 break

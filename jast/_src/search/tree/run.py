@@ -108,7 +108,7 @@ class Round(NamedTuple):
     """Number of the first tree."""
 
 
-def grow_all(turn: Round, watch: Watch, ways: work.Placement, threads: int) -> work.UnitsRun:
+def grow_all(turn: Round, watch: Watch, placement: work.Placement, threads: int) -> work.UnitsRun:
     """Grow one tree a key, a group of lanes at a time: `runtime.work.UnitsRun` with a tuple of
     `TreeBatch` in the order of the keys. ``watch`` counts simulations; an interruption ends all
     trees at their next chunk.
@@ -121,7 +121,7 @@ def grow_all(turn: Round, watch: Watch, ways: work.Placement, threads: int) -> w
         lambda batches, number, new: (*batches, new),
         (),
         watch,
-        ways._replace(name=f"trees-{turn.first}"),
+        placement._replace(name=f"trees-{turn.first}"),
         size=lambda done: (turn.first + min(done * lanes, trees)) * each,
         threads=threads,
         cut=True,
