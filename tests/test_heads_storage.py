@@ -312,3 +312,18 @@ def test_load_refuses_an_unknown_activation(tmp_path, monkeypatch):
     monkeypatch.undo()
     with pytest.raises(ValueError, match="has the activation 'mish', .* that wrote the file"):
         jast.heads.load(tmp_path / "h")
+
+
+def test_load_refuses_other_files(tmp_path):
+    path = tmp_path / "h"
+    path.write_text("levels,3")
+    with pytest.raises(ValueError, match="load: .*h is not a file of jast.save"):
+        jast.heads.load(path)
+    jast.save(path, jast._src.core.failures.empty(WALK))
+    with pytest.raises(ValueError, match="load: .*h holds Failures, expected Heads"):
+        jast.heads.load(path)
+    with pytest.raises(FileNotFoundError):
+        jast.heads.load(tmp_path / "none")
+    jast.save(path, made())
+    with pytest.raises(ValueError, match="load: .*h holds Heads, expected Failures"):
+        jast.failures.load(path)

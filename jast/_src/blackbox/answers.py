@@ -5,7 +5,7 @@ JAX.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from hashlib import blake2b
 from typing import NamedTuple
 
@@ -13,7 +13,7 @@ import numpy as np
 
 from jast._src.blackbox.worker import Reply, history
 
-__all__ = ["Answer", "Answers", "keys_of", "part_of"]
+__all__ = ["Answer", "Answers", "answer_of", "keys_of", "part_of"]
 
 HELD = 2**26
 """Bytes that answers may take, those of failures and those of others each; then the oldest goes."""
@@ -35,6 +35,12 @@ class Answer(NamedTuple):
     log_p: float
     seen: bytes
     """float64: what ``observe`` returned."""
+
+
+def answer_of(outcomes: Sequence[np.ndarray], i: int) -> Answer:
+    """The `Answer` of row ``i`` of the first five fields of a `Reply`."""
+    event, distance, terminal, log_p, seen = (a[i] for a in outcomes)
+    return Answer(bool(event), float(distance), bool(terminal), float(log_p), seen.tobytes())
 
 
 class Failing(NamedTuple):
@@ -73,10 +79,8 @@ class Answers:
 
     def put_part(self, part: list[np.ndarray], starts: int) -> None:
         """The answers and failures of a part of a checkpoint (`part_of`)."""
-        keys, event, distance, terminal, log_p, seen, *_ = part
-        for i, key in enumerate(keys):
-            numbers = float(distance[i]), bool(terminal[i]), float(log_p[i])
-            self.put(key.tobytes(), Answer(bool(event[i]), *numbers, seen[i].tobytes()))
+        for i, key in enumerate(part[0]):
+            self.put(key.tobytes(), answer_of(part[1:6], i))
         self.put_failing(part, starts)
 
     def put_failing(self, part: list[np.ndarray], starts: int) -> None:

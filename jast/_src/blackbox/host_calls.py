@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jast._src.blackbox.answers import Answer, Answers, keys_of, part_of
+from jast._src.blackbox.answers import Answers, answer_of, keys_of, part_of
 from jast._src.blackbox.worker import fill
 from jast._src.runtime.host_errors import Log
 
@@ -245,35 +245,19 @@ class Host:
                 fill(self.x, [a[i, : t[i]] for a in xs]),
             )
 
-        said = {}
-        for i, kind, message in reply.problems:
-            said[i] = kind, message
-        with np.errstate(over="ignore"):
-            large = ~np.isfinite(reply.distance.astype(dtype))
-        for i in np.flatnonzero(large):
-            said.setdefault(
-                i,
-                ("NaN", f"distance is {reply.distance[i]:g}, too large for {np.dtype(dtype).name}"),
-            )
-        for i, (kind, message) in sorted(said.items()):
+        problems = _problems(reply, dtype)
+        for i, (kind, message) in sorted(problems.items()):
             self.log.add(kind, message, partial(example, i))
         found, new = {}, []
         for i, row in enumerate(rows.tolist()):
-            answer = Answer(
-                bool(reply.event[i]),
-                float(reply.distance[i]),
-                bool(reply.terminal[i]),
-                float(reply.log_p[i]),
-                reply.seen[i].tobytes(),
-            )
-            found[row] = found[keys[row]] = answer
-            before = self.answers.get(keys[row])
-            if before is None:
+            key, answer = keys[row], answer_of(reply[:5], i)
+            found[row] = found[key] = answer
+            if (before := self.answers.get(key)) is None:
                 new.append(i)
-                self.answers.put(keys[row], answer)
-            elif i not in said:
+                self.answers.put(key, answer)
+            elif i not in problems:
                 self._compare(before, answer, partial(example, i))
-        valid = [i for i in new if i not in said]
+        valid = [i for i in new if i not in problems]
         if valid:
             part = part_of([keys[i] for i in rows[valid]], valid, reply, t, x0, xs)
             self.answers.put_failing(part, self.starts)
@@ -295,3 +279,14 @@ class Host:
                 self.differs = True
                 self.log.add("not deterministic", f"the same disturbances gave {what}", example)
                 return
+
+
+def _problems(reply, dtype):
+    """What went wrong in a reply: {its row: (kind, message)}."""
+    problems = {i: (kind, message) for i, kind, message in reply.problems}
+    with np.errstate(over="ignore"):
+        large = ~np.isfinite(reply.distance.astype(dtype))
+    for i in np.flatnonzero(large):
+        said = f"distance is {reply.distance[i]:g}, too large for {np.dtype(dtype).name}"
+        problems.setdefault(i, ("NaN", said))
+    return problems

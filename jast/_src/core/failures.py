@@ -345,6 +345,7 @@ def load(path: PathLike, sim: Simulator | None = None) -> tuple[Failures, dict[s
         {'seed': 0}
     """
     failures, beside = save_load.restore(path, sim)
+    save_load.check_kind(path, failures, Failures)
     return failures, beside.get("settings", {})
 
 

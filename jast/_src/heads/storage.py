@@ -38,7 +38,9 @@ def load(path: PathLike, heads: Heads | None = None) -> Heads:
         ...     jast.heads.load(path).policy is None
         True
     """
-    return save_load.load(path, heads=heads)
+    found = save_load.load(path, heads=heads)
+    save_load.check_kind(path, found, Heads)
+    return found
 
 
 def parts(heads: Heads) -> dict[str, Any]:

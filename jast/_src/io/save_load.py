@@ -15,7 +15,17 @@ from jast._src.core.typing import PathLike
 from jast._src.io import former_files, npz
 from jast._src.io.codec import Given, check_episodes, decode, encode, place_of
 
-__all__ = ["from_bytes", "load", "parts", "restore", "save", "store", "to_bytes", "whole"]
+__all__ = [
+    "check_kind",
+    "from_bytes",
+    "load",
+    "parts",
+    "restore",
+    "save",
+    "store",
+    "to_bytes",
+    "whole",
+]
 
 FORMAT = "jast result"
 VERSION = 1
@@ -88,6 +98,15 @@ def restore(path: Any, sim: Any = None, heads: Any = None) -> tuple[Any, dict[st
     header = former_files.translate(header)
     beside = {k: decode(v, path, arrays, Given()) for k, v in header["beside"].items()}
     return whole(path, header, arrays, sim, heads), beside
+
+
+def check_kind(path: Any, value: Any, kind: type) -> None:
+    """ValueError unless a file held a value of this kind."""
+    if not isinstance(value, kind):
+        raise ValueError(
+            f"load: {path} holds {type(value).__name__}, expected {kind.__name__}: jast.load reads"
+            " results of every kind"
+        )
 
 
 def to_bytes(result: Any) -> bytes:

@@ -17,9 +17,8 @@ from jast._src.core.signature import signature_of
 from jast._src.core.simulator import Simulator
 from jast._src.estimate.splitting.levels import FRESH, Played
 from jast._src.runtime._jax import quick
-from jast._src.runtime.host_errors import sources
 
-__all__ = ["ObjectPaths", "branching_objects", "check_objects"]
+__all__ = ["ObjectPaths"]
 
 LANES = 32
 """Objects that are moved side by side, by one draw of disturbances for all of them; so many are
@@ -174,101 +173,6 @@ class ObjectPaths:
         if lane.over and lane.thing is not None:
             self.objects.release(lane.thing)
             lane.thing = None
-
-
-def branching_objects(name: str, sim: Simulator) -> Any:
-    """What saves and resumes the objects of a black box; None for a simulator in JAX. ValueError
-    for a black box without objects in this process.
-    """
-    if next(sources(sim, "calls"), None) is None:
-        return None
-    found = next(sources(sim, "branching"), None)
-    if found is None:
-        raise ValueError(
-            f"{name}: sim must be a black box of objects that are judged at every state"
-            " (episodic=False), since a function of whole episodes cannot be resumed: use"
-            " jast.estimate.failure_probability"
-        )
-    return found.branching()
-
-
-def check_objects(name: str, key: jax.Array, sim: Simulator, objects: Any) -> int:
-    """Play an episode, and its second half twice more from a saved state; how many steps that took.
-    ValueError where they do not come to the same.
-    """
-    paths, saved, at, looks, xs = ObjectPaths(key, sim, None, 1, objects), None, 0, [], []
-    (lane,) = paths.begin(1)
-    _check_methods(name, lane.thing)
-    while not lane.over:
-        if lane.steps & (lane.steps - 1) == 0:  # at 0, 1, 2, 4, ..: at half of the whole, or later
-            saved, at = _attempt(name, objects.save, lane.thing), lane.steps
-        xs.append([a[0] for a in paths.draw([lane])])
-        looks.append(paths.move(lane, xs[-1]))
-    steps = lane.steps
-    if saved is None:
-        return steps
-    for _ in range(2):  # the second time, of what the first one left of it
-        again = _attempt(name, objects.resume, saved, lane.x0)
-        found = _replayed(objects, again, lane.x0, xs, at)
-        steps += len(found)
-        if not _alike(looks[at:], found):
-            fresh = _replayed(objects, objects.begin(lane.x0)[0], lane.x0, xs, 0)
-            raise ValueError(_difference(name, saved.copied, at, _alike(looks, fresh)))
-    return steps
-
-
-def _check_methods(name, thing):
-    has = [method for method in ("snapshot", "restore") if callable(getattr(thing, method, None))]
-    if len(has) == 1:
-        raise ValueError(
-            f"{name}: an object of the black box must have both methods snapshot() and"
-            f" restore(saved), or neither; received {type(thing).__name__} with {has[0]} only"
-        )
-
-
-def _attempt(name, function, *args):
-    """What ``function`` returns; ValueError where an object cannot be saved or resumed."""
-    try:
-        return function(*args)
-    except Exception as error:
-        raise ValueError(
-            f"{name}: an object of the black box must have working methods snapshot() and"
-            " restore(saved), or be one that copy.deepcopy copies; received"
-            f" {type(error).__name__}: {error}"
-        ) from error
-
-
-def _replayed(objects, thing, x0, xs, at):
-    """What an object at step ``at`` says after each further one of the disturbances ``xs``."""
-    found = []
-    for t in range(at + 1, len(xs) + 1):
-        if thing is None:
-            break
-        thing, look = objects.move(thing, x0, [np.stack(a) for a in zip(*xs[:t], strict=True)])
-        found.append(look)
-    if thing is not None:
-        objects.release(thing)
-    return found
-
-
-def _alike(looks, others):
-    return len(looks) == len(others) and all(a.same(b) for a, b in zip(looks, others))
-
-
-def _difference(name, copied, at, deterministic):
-    """Why the same disturbances came to another end."""
-    if not deterministic:
-        return (
-            f"{name}: the black box must be deterministic, received two outcomes of the same"
-            " disturbances: seed every random number generator in initialize, or make its draws"
-            " part of the disturbance"
-        )
-    what = "a copy by copy.deepcopy" if copied else "restore(saved) of its snapshot()"
-    return (
-        f"{name}: {what} must bring back all of an object, received one that goes on differently"
-        f" from step {at} on under the same disturbances: is something outside of the object, or"
-        " shared by saved states that change with it?"
-    )
 
 
 def _with_look(state, look):

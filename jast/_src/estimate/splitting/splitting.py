@@ -20,7 +20,8 @@ from jast._src.estimate.population.search import Answer, contradictions
 from jast._src.estimate.replicates import LOST_MODE_REMARK, MIN_REPLICATES, mean_of_replicates
 from jast._src.estimate.splitting.device_paths import DevicePaths, require_paths
 from jast._src.estimate.splitting.levels import Run, climb
-from jast._src.estimate.splitting.object_paths import ObjectPaths, branching_objects, check_objects
+from jast._src.estimate.splitting.object_checks import branching_objects, check_objects
+from jast._src.estimate.splitting.object_paths import ObjectPaths
 from jast._src.runtime import work
 from jast._src.runtime.backends import Task
 from jast._src.runtime.checkpoints import open_checkpoint
