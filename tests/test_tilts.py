@@ -279,14 +279,28 @@ def test_choices(name):
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(
-    "rate, threshold, horizon, budget",
-    [(0.1, 5.0, 100, 30_000), (0.1, 5.0, 300, 30_000), (0.4, 5.5, 100, 40_000)],
-)
-def test_long_first_passage(rate, threshold, horizon, budget):
-    sim = autoregression(rate, threshold, horizon)
-    found = failure_probability(jax.random.key(0), sim, budget)
-    check_estimate(found, autoregression_probability(rate, threshold, horizon))
+@pytest.mark.parametrize("horizon", [100, 300])
+def test_long_first_passage(horizon):
+    found = failure_probability(jax.random.key(0), autoregression(0.1, 5.0, horizon), 30_000)
+    check_estimate(found, autoregression_probability(0.1, 5.0, horizon))
+
+
+@pytest.mark.long
+def test_first_passage_of_what_forgets_fast():
+    """Some .07 effective draws a draw, of which 40,000 evaluations are just enough: of the keys 0
+    to 9 one was flagged, and which one hangs on a processor's rounding. Were it one in ten, two of
+    three keys would be flagged in 3 % of all tries. No answer that is believed is wrong, and what
+    plain draws guarantee holds for all.
+    """
+    sim, truth = autoregression(0.4, 5.5, 100), autoregression_probability(0.4, 5.5, 100)
+    answers = [failure_probability(jax.random.key(k), sim, 40_000) for k in range(3)]
+    believed = [found for found in answers if found.reliable]
+    assert len(believed) >= 2, "\n".join(map(str, answers))
+    for found in believed:
+        check_estimate(found, truth, budget=40_000)
+    for found in answers:
+        low, high = found.guaranteed
+        assert low <= truth <= high, str(found)
 
 
 def test_several_gaussians_serve_where_one_does_not():
