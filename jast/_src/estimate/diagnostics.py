@@ -116,11 +116,13 @@ def mode_warnings(shares: np.ndarray, sizes: np.ndarray, error: float) -> list[s
     ]
 
 
-def weight_warnings(failures: int, ess: float, k_hat: float, max_share: float) -> list[str]:
+def weight_warnings(
+    failures: int, ess: float, k_hat: float, max_share: float, min_ess: int = MIN_ESS
+) -> list[str]:
     """Why weights must not be trusted: a list of texts, empty where nothing speaks against them."""
     found = []
-    if ess < MIN_ESS:
-        found.append(f"effective sample size {ess:.3g}, below {MIN_ESS}")
+    if ess < min_ess:
+        found.append(f"effective sample size {ess:.3g}, below {min_ess}")
     if np.isnan(k_hat):
         found.append(f"{failures} failures are too few to judge the tail of the weights")
     elif k_hat > MAX_K_HAT:

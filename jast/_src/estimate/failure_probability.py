@@ -108,11 +108,14 @@ def failure_probability(
     simulator says at every state how far it is from failing, so that one run tells as many limit
     states as it has moments. The system is linearised next to the boundary that is nearest, by one
     run for each number, or by gradients where it is judged at its end alone. Each moment then has a
-    half-space of failure, whose depth a run or two correct and whose mirror image is tried. The
-    proposal draws beyond these half-spaces, nearer where the failures of three batches lie nearer.
-    The audit is a small one: it finds modes of a tenth of the probability or more. Where such
-    proposals do not serve, the other searches have what is left, if that is 5000 episodes or more;
-    else plain draws or subset simulation answer, and mostly UNRELIABLE.
+    half-space of failure, whose depth a run or two correct and whose mirror image is tried.
+    Failures of wide noise that none of them has lead to others. The proposal draws beyond these
+    half-spaces, nearer where the failures of three batches lie nearer. The audit is a small one: it
+    finds modes of a tenth of the probability or more. With some hundred episodes it is 40 draws of
+    wide noise, whose failures must come to lie where the proposal draws. Fewer than 30 effective
+    draws make such an estimate UNRELIABLE. Where such proposals do not serve, the other searches
+    have what is left, if that is 5000 episodes or more; else plain draws or subset simulation
+    answer, and mostly UNRELIABLE.
 
     A failure mode below ``unseen`` that all explorers miss is missing without a sign. A
     KeyboardInterrupt during the last part ends it with the estimate of the draws so far; before

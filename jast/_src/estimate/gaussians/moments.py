@@ -19,6 +19,7 @@ from jast._src.estimate.gaussians.half_spaces import (
     that_matter,
 )
 from jast._src.estimate.gaussians.mixture_fit import effective_sample_size
+from jast._src.estimate.host_populations import draw_wide
 from jast._src.estimate.proposal_search.search_state import (
     SearchState,
     add_batch,
@@ -44,7 +45,8 @@ four of them is then known to a factor of two, and the draws tell the rest."""
 ROUNDS = 6
 """Linearisations from one start at most; what is linear or nearly so took 2 to 4."""
 GIVEN = 4
-"""Failures that came with the call, and that no plane explains, from which others start."""
+"""Failures that came with the call, or of wide noise, and that no plane has, from which others
+start."""
 ROOTS = 3
 """Runs at most to see how deep a half-space is on the way to its own design point."""
 FARTHER = 2.0
@@ -76,6 +78,7 @@ def explore_moments(f: GaussianFamily, given: np.ndarray | None, gradients: bool
         state, planes = _approach(f, state, planes, opposite, gradients, end)
     if not len(planes.depth):
         return state.note("moments: no slope leads to failures")
+    state, planes = _approach_wide(f, state, planes, gradients, end)
     state, planes = _with_mirror_images(f, state, that_matter(planes, f.dimension))
     depths = f"at {planes.depth.min():.3f} to {planes.depth.max():.3f}"
     state = state.note(f"moments: {len(planes.depth)} half-spaces {depths}")
@@ -119,6 +122,22 @@ def _approach(f, state, planes, start, gradients, end):
         if abs(new.depth[top] - said.depth[top]) <= KNOWN:
             break
         last, start = start, INSIDE * new.nearest[top]
+    return state, planes
+
+
+def _approach_wide(f, state, planes, gradients, end):
+    """The state and the `Planes` after linearising from failures of wide noise that none of the
+    ``planes`` has.
+    """
+    n = f.settings.wide_audit
+    if state.spent + n > end:
+        return state, planes
+    z, _, width = draw_wide(f.context.rng, f.sim, n, np.logaddexp.reduce(planes.log_mass))
+    state, tried = state.note(f"moments: {len(z)} fail under {width:.2f} times wider noise", n), 0
+    for point in z.astype(np.float64):
+        if tried < GIVEN and not (planes.normal @ point > planes.depth - KNOWN).any():
+            state, planes = _approach(f, state, planes, INSIDE * point, gradients, end)
+            tried += 1
     return state, planes
 
 

@@ -10,7 +10,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jast._src.estimate.gaussians.mixture_fit import effective_sample_size
-from jast._src.estimate.host_populations import FINAL_MOVES, LEVEL_SHARE, equilibrate, explore
+from jast._src.estimate.host_populations import (
+    FINAL_MOVES,
+    LEVEL_SHARE,
+    draw_wide,
+    equilibrate,
+    explore,
+)
 from jast._src.estimate.proposal_search.adapt import adapt_proposal
 from jast._src.estimate.proposal_search.search_state import (
     Family,
@@ -46,10 +52,13 @@ def audit_proposal(family: Family, state: SearchState) -> SearchState:
     end = settings.search_end * family.budget
     for left in reversed(range(settings.audits)):
         state = state._replace(reasons=())  # what is still wrong is said again
-        state, missing = _missing(family, state, cooled)
+        wide = settings.wide_audit and not _population_size(family, state)
+        if wide:
+            state, cooled = _equilibrate_cooled(family, _draw_widely(family, state))
+        state, missing = _missing(family, state, cooled, wide)
         if not missing:
             break
-        if not left or state.spent + LEAST_BATCHES * family.batch > end:
+        if wide or not left or state.spent + LEAST_BATCHES * family.batch > end:
             return _check_given(family, _report(state, missing))
         state = _absorb(family, state, missing)
         state = adapt_proposal(family, state, settings.audit_refits, end)
@@ -111,10 +120,22 @@ def _equilibrate_cooled(family, state):
     return family.as_points(state, population.z[rows], population.used[rows])
 
 
-def _missing(family, state, cooled):
-    """[`Missing`, ...] by populations, those of the search too, and by the ``cooled`` failures."""
+def _draw_widely(family, state):
+    """The state with the uncovered failures among draws of wide noise."""
+    n = family.settings.wide_audit
+    z, used, width = draw_wide(family.context.rng, family.sim, n, state.log_mean)
+    state, points = family.as_points(state, z, used)
+    rows = uncovered(family, state, points)
+    text = f"audit: {rows.sum()} of {len(rows)} failures under {width:.2f} times wider noise"
+    return state.note(f"{text} not covered", n)._replace(cooled=z[rows])
+
+
+def _missing(family, state, cooled, wide):
+    """[`Missing`, ...] by populations, those of the search too, and by the ``cooled`` failures;
+    where noise was ``wide`` no population is needed.
+    """
     settings = family.settings
-    state, found = _explore_uncovered(family, state)
+    state, found = (state, []) if wide else _explore_uncovered(family, state)
     missing = []
     for share, p in [*found, *((1.0, p) for p in state.populations)]:
         state, points = family.as_points(state, p.points, p.used)
@@ -135,26 +156,41 @@ def _explore_uncovered(family, state):
     """A population down the levels of the miss distance that is kept out of what the proposal
     covers: [(its probability as a multiple of what the proposal found, `Explored`)], or [].
     """
-    settings = family.settings
-    least = state.log_mean + math.log(settings.tolerated_mass / 2)
-    room = settings.search_end * family.budget - state.spent
-    room = min(settings.audit_share * family.budget, room)
-    # as many points as can afford the levels down to there
-    fewest = settings.audit_population_least
-    size = int(room / (least / math.log(LEVEL_SHARE) + FINAL_MOVES + MORE_LEVELS))
-    size = min(size, max(family.budget // POPULATION_PART, fewest))
-    if size < fewest:
+    if not (size := _population_size(family, state)):
         return state.with_reason(UNFINISHED), []
     key = family.context.next_key()
     outside = family.exclusion(state.q, _coverage_threshold(family, state))
-    most = int(settings.audit_overrun * room)
     p = explore(
-        key, family.sim, size, covered=outside, min_log_probability=least, max_evaluations=most
+        key,
+        family.sim,
+        size,
+        covered=outside,
+        min_log_probability=_least_log_probability(family, state),
+        max_evaluations=int(family.settings.audit_overrun * _room(family, state)),
     )
     state = state.note(f"audit: a population of {size}", p.evaluations)
     if not p.complete:
         state = state.with_reason(UNFINISHED)
     return state, [(math.exp(min(p.log_mean - state.log_mean, 50)), p)] if p.reached else []
+
+
+def _population_size(family, state):
+    """As many points as can afford the levels down to what is tolerated; 0 for too few."""
+    levels = _least_log_probability(family, state) / math.log(LEVEL_SHARE)
+    fewest = family.settings.audit_population_least
+    size = int(_room(family, state) / (levels + FINAL_MOVES + MORE_LEVELS))
+    return min(size, max(family.budget // POPULATION_PART, fewest)) if size >= fewest else 0
+
+
+def _room(family, state):
+    """Evaluations that an audit may take."""
+    s = family.settings
+    return min(s.audit_share * family.budget, s.search_end * family.budget - state.spent)
+
+
+def _least_log_probability(family, state):
+    """Of what an audit looks for."""
+    return state.log_mean + math.log(family.settings.tolerated_mass / 2)
 
 
 def _unseen_mass(family, state, missing):

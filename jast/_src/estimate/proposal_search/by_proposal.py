@@ -17,7 +17,7 @@ from jast._src.core.failures import Failures
 from jast._src.core.float_resolution import rounding_problem
 from jast._src.core.simulator import Simulator
 from jast._src.core.typing import Callback
-from jast._src.estimate import diagnostics, weight_sums
+from jast._src.estimate import weight_sums
 from jast._src.estimate.estimate import Estimate, estimate_from_counts, estimate_from_weights
 from jast._src.estimate.gaussians.exploration import draw_model, explore_failures
 from jast._src.estimate.gaussians.family import GaussianFamily
@@ -95,7 +95,8 @@ class Search(NamedTuple):
     @property
     def suffices(self) -> bool:
         """Whether what is left of the budget tells the probability by the proposal."""
-        return self.efficiency * (self.family.budget - self.state.spent) > diagnostics.MIN_ESS
+        left = self.family.budget - self.state.spent
+        return self.efficiency * left > self.family.settings.min_ess
 
     @property
     def proposal(self) -> Any:
@@ -319,6 +320,7 @@ def _draw_proposal(request, search, watch, reasons):
         plain=state.plain,
         level=request.level,
         history=state.history,
+        min_ess=f.settings.min_ess,
     )
     return found._replace(proposal=search.proposal)
 
