@@ -12,6 +12,7 @@ from jast._src.core.typing import Array
 
 __all__ = [
     "MIN_ESS",
+    "MIN_MODE_ESS",
     "MIN_MODE_SHARE",
     "mode_warnings",
     "pareto_k",
