@@ -169,6 +169,19 @@ def plane(numbers: int) -> Simulator:
     return limit_state(Partial(hyperplane, jnp.asarray(3.5)), numbers)
 
 
+def first_of(depths: Any, ways: Any, x: Any) -> Any:
+    """How far the nearest of some planes is."""
+    return jnp.min(depths - ways @ x)
+
+
+def planes(*depths: float) -> Simulator:
+    """Fails beyond any of some planes of 60 numbers that stand square on one another: no slope near
+    the middle shows more than one.
+    """
+    ways = np.linalg.qr(np.random.default_rng(0).standard_normal((60, len(depths)))).Q.T.copy()
+    return limit_state(Partial(first_of, jnp.asarray(depths), jnp.asarray(ways)), 60)
+
+
 def forced(mean: float, deviation: float) -> Simulator:
     """`oscillator`."""
     return limit_state(Partial(oscillator, jnp.asarray(mean), jnp.asarray(deviation)), 6)
@@ -225,11 +238,13 @@ SYSTEMS = {
 # diffusion and option: transition operators and quadrature; closed loops:
 # `benchmarks.closed_loops`
 MANY = {
+    "lane, 600": System(lane, 5.0355e-5, 600),
     "lane, 2000": System(lane, 5.0355e-5, 2000),
     "lane, 5000": System(lane, 5.0355e-5, 5000),
     "lane in Python": System(slow_lane, 5.0355e-5, 2000),
     "plane 100": System(partial(plane, 100), 2.3262908e-4, 1200),
     "plane 1000": System(partial(plane, 1000), 2.3262908e-4, 1200),
+    "three planes, 600": System(partial(planes, 3.5, 3.6, 3.7), 4.9945816e-4, 600),
     "diffusion 3, 50": System(partial(diffusion, 3.0, 50), 1.0877e-5, 1200),
     "diffusion 3, 200": System(partial(diffusion, 3.0, 200), 9.1231e-6, 1200),
     "diffusion 4, 50": System(partial(diffusion, 4.0, 50), 2.346e-8, 1200),

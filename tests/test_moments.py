@@ -9,7 +9,7 @@ import pytest
 from scipy.stats import norm
 
 import jast
-from benchmarks.few_calls import SlowLane, plane, slow_lane
+from benchmarks.few_calls import SlowLane, plane, planes, slow_lane
 from benchmarks.first_minute import lane
 from jast._src.estimate.gaussians import half_spaces
 from jast._src.estimate.gaussians.family import GaussianFamily
@@ -111,12 +111,6 @@ def test_a_plane_of_a_hundred_numbers(budget, gradients, error):
     p = failure_probability(jax.random.key(1), plane(100), budget, gradients=gradients)
     assert p.reliable and p.evaluations == budget
     assert abs(p.mean / norm.sf(3.5) - 1) < 4 * p.relative_error < 4 * error
-
-
-def planes(*depths):
-    """Fails beyond any of some planes of 60 numbers that stand square on one another."""
-    ways = np.linalg.qr(np.random.default_rng(0).standard_normal((60, len(depths)))).Q.T.copy()
-    return limit_state(lambda z: jnp.min(jnp.asarray(depths) - ways @ z), 60)
 
 
 def test_wide_noise_has_a_tenth_of_failures_beyond_a_plane():
