@@ -52,7 +52,7 @@ def audit_proposal(family: Family, state: SearchState) -> SearchState:
     end = settings.search_end * family.budget
     for left in reversed(range(settings.audits)):
         state = state._replace(reasons=())  # what is still wrong is said again
-        wide = settings.wide_audit and not _population_size(family, state)
+        wide = _affords_wide_noise(family, state) and not _population_size(family, state)
         if wide:
             state, cooled = _equilibrate_cooled(family, _draw_widely(family, state))
         state, missing = _missing(family, state, cooled, wide)
@@ -118,6 +118,12 @@ def _equilibrate_cooled(family, state):
     rows = population.score == -np.inf
     state = state.note(f"audit: {len(z)} failures of wide noise moved", sampler.evaluations)
     return family.as_points(state, population.z[rows], population.used[rows])
+
+
+def _affords_wide_noise(family, state):
+    """Whether an audit has room for draws of wide noise, and for the burn-in of a failure."""
+    s = family.settings
+    return bool(s.wide_audit) and _room(family, state) > s.wide_audit + s.burn_in_moves
 
 
 def _draw_widely(family, state):

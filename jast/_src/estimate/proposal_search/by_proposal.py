@@ -160,10 +160,11 @@ def _search(request, context):
 
 
 def _serves(request, search):
-    """Whether the answer is drawn from the proposal: where populations, or plain draws, would
-    answer in its place only from an efficient one, as the weights of others hide what they miss.
+    """Whether the answer is drawn from the proposal. Tilts of many steps must be efficient where
+    populations would answer in their place: a few effective draws hide what they miss.
     """
-    least = request.settings.family_efficiency if request.otherwise else 0.0
+    others = request.otherwise and _has_many_steps(request)
+    least = request.settings.family_efficiency if others else 0.0
     return search.suffices and is_efficient(search.state, least)
 
 
