@@ -270,15 +270,6 @@ def test_populations_answer_where_tilts_do_not_serve(monkeypatch):
     assert found.plain[-1] > 0 and found.evaluations < 60_000
 
 
-@pytest.mark.parametrize("horizon, populations, serves", [(60, 1, 0), (60, 0, 1), (20, 1, 1)])
-def test_tilts_of_many_steps_give_way_where_they_are_not_efficient(horizon, populations, serves):
-    sim = autoregression(horizon=horizon)
-    family = TiltFamily(sim, 50_000, search_context(jax.random.key(0)))
-    search = by_proposal.Search(family, SearchState(q=family.untilted(), efficiency=0.01))
-    request = by_proposal.Request("", jax.random.key(0), sim, 50_000, otherwise=populations or None)
-    assert search.suffices and by_proposal._serves(request, search) == bool(serves)
-
-
 @pytest.mark.long
 @pytest.mark.parametrize("name", ["queue", "components", "dropout 1e-7", "contaminated", "bimodal"])
 def test_choices(name):

@@ -156,16 +156,7 @@ def _search(request, context):
                 return best
         if math.exp(min(state.log_mean, 0.0)) > settings.family_efficiency:
             return best  # plain draws serve
-    return _audit(best) if _serves(request, best) else best
-
-
-def _serves(request, search):
-    """Whether the answer is drawn from the proposal. Tilts of many steps must be efficient where
-    populations would answer in their place: a few effective draws hide what they miss.
-    """
-    others = request.otherwise and _has_many_steps(request)
-    least = request.settings.family_efficiency if others else 0.0
-    return search.suffices and is_efficient(search.state, least)
+    return _audit(best) if best.suffices else best
 
 
 def _families(request):
@@ -280,21 +271,20 @@ def _draw(request, search, reasons):
     watch = Watch(name, n, "episode", *request.watched)
     often = math.exp(min(state.log_p, 0.0)) * n >= request.settings.plain_failures
     about_proposal = [*reasons, *state.reasons]
-    serves = _serves(request, search)
-    if not (serves or often) and request.otherwise and _has_many_steps(request):
+    if not (search.suffices or often) and request.otherwise and _has_many_steps(request):
         found = request.otherwise(n)
         return found._replace(
             episodes=state.spent + found.episodes,
             history=(*state.history, *found.history),
             plain=tuple(map(sum, zip(state.plain, found.plain, strict=True))),
         )
-    if not serves and not often and state.log_p > -math.inf:
+    if not search.suffices and not often and state.log_p > -math.inf:
         found = fallback_estimate(key, sim, n, state.log_p, level, about_proposal or [UNUSABLE])
         if found is not None:
             spent, history = state.spent + found.episodes, (*state.history, *found.history)
             return found._replace(episodes=spent, history=history, plain=state.plain)
-    if serves or (search.efficiency and not often):
-        against = about_proposal if serves else [*about_proposal, UNUSABLE]
+    if search.suffices or (search.efficiency and not often):
+        against = about_proposal if search.suffices else [*about_proposal, UNUSABLE]
         return _draw_proposal(request, search, watch, against)
     shared = key, sim, f.batch, n
     total, notes, lost = chunks(simulate_points, shared, f.batch, watch, request.placement)
