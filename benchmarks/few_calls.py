@@ -183,7 +183,7 @@ def planes(*depths: float) -> Simulator:
 
 
 def forced(mean: float, deviation: float) -> Simulator:
-    """`oscillator`."""
+    """The nonlinear `oscillator` under a force of this mean and standard deviation."""
     return limit_state(Partial(oscillator, jnp.asarray(mean), jnp.asarray(deviation)), 6)
 
 

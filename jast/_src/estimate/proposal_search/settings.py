@@ -171,8 +171,9 @@ class SearchSettings(NamedTuple):
     audit_share: float = 0.15
     """What a population of an audit is to cost."""
     wide_audit: int = 0
-    """Draws of wide noise in place of a population that the budget does not afford: of 40 one fails
-    with a chance of .94 in a mode that has a tenth of a probability of 2e-4, .97 of 1e-8."""
+    """Draws of wide noise before half-spaces are fitted, and in place of a population that the
+    budget does not afford: of 40 one fails with a chance of .94 in a mode that has a tenth of a
+    probability of 2e-4, .97 of 1e-8."""
     audit_overrun: float = 1.5
     """Factor on that, as levels fall more slowly where miss distances take few values."""
     audit_population_least: int = 40
