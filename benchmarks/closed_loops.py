@@ -24,7 +24,7 @@ from jax import lax
 import jast
 from benchmarks.operators import OPERATORS, SYSTEMS, easier
 from benchmarks.sizes import options, print_report, printer, size
-from jast._src.normal_space.transform import outcome
+from jast._src.normal_space.transform import dimension, outcome
 from jast.distributions import Bernoulli, Independent, Joint, Normal
 
 __all__ = ["JUDGED", "RARE", "TUNED", "Loop"]
@@ -243,7 +243,7 @@ def plain(loop: Loop, draws: int, seed: int = 0) -> tuple[int, int]:
 
 @partial(jax.jit, static_argnames="blocks")
 def _failing(sim, key, blocks):
-    numbers = jast._src.normal_space.transform.dimension(sim)
+    numbers = dimension(sim)
 
     def block(i, count):
         z = jax.random.normal(jax.random.fold_in(key, i), (LANES, numbers))

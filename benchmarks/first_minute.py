@@ -4,7 +4,7 @@
 Each system has a process of its own, without a cache of compiled programs, that makes one call four
 times: the first, the same again, with another key, and with another budget. Of each: CPU seconds,
 seconds of the clock, programs that were compiled, seconds that tracing, lowering and compiling
-took, and how many of the programs contain the user's ``step``. Then the CPU time of importing jast
+took, and how many of the programs contain the user's ``step``. Then the CPU time of loading jast
 over that of importing JAX, and the first and the second ``python -m jast``, from an empty cache.
 Systems of other people's libraries are left out where the library is not installed.
 """
@@ -141,9 +141,17 @@ def ways(make: Callable) -> list[tuple[float, float]]:
     return rows
 
 
-def importing(what: str, times: int) -> float:
-    """CPU seconds of a fresh process that imports ``what``."""
-    code = f"import {what}, time; print(time.process_time())"
+IMPORTED = {
+    "import jast": "import jast",
+    "jast.Simulator and distributions": "import jast; jast.Simulator, jast.distributions.Normal",
+    "jast.stress": "import jast; jast.stress",
+}
+"""What is loaded when it is first asked for, beside ``import jax``."""
+
+
+def loading(code: str, times: int) -> float:
+    """CPU seconds of a fresh process that runs ``code``, the least of so many ``times``."""
+    code = f"{code}; import time; print(time.process_time())"
     command = [sys.executable, "-c", code]
     run = partial(subprocess.run, command, check=True, capture_output=True, text=True)
     return min(float(run().stdout) for _ in range(times))
@@ -194,8 +202,10 @@ def main(argv: list[str] | None = None) -> None:
             label = f"{name}, {kind}"
             say(f"{label:32}{cpu:8.1f}{wall:8.1f}{programs:10}{compilation:11.1f}{steps:9}")
     times = size(args, IMPORTS, IMPORTS, 1)
-    ratio = results["import jast / import jax"] = importing("jast", times) / importing("jax", times)
-    say(f"import jast / import jax: {ratio:.2f}")
+    jax_alone = loading("import jax", times)
+    for what, code in IMPORTED.items():
+        ratio = results[f"{what} / import jax"] = loading(code, times) / jax_alone
+        say(f"{what} / import jax: {ratio:.2f}")
     if not (args.quick or args.smoke):
         first, second = results["python -m jast"] = command_line([])
         say(f"python -m jast: {first:.1f} s, then {second:.1f} s")

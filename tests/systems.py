@@ -8,6 +8,7 @@ import pytest
 from jax.tree_util import Partial
 
 import jast
+from jast._src.core.rewards import STANDARD
 from jast.distributions import Categorical, Independent, Joint, Normal, seeds
 
 PUBLISHED = [
@@ -33,7 +34,7 @@ PUBLISHED = [
     0.454360642513824,
 ]
 """The best failure published for the ferry: reward 29.092054904933118, collision at step 20."""
-TOLD = dict(reward=jast._src.core.rewards.STANDARD, actions=jast.actions.samples())
+TOLD = dict(reward=STANDARD, actions=jast.actions.samples())
 """What a search needs no episodes before it for, so that its counts are exact."""
 
 S0 = dict(

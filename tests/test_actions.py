@@ -14,6 +14,7 @@ from systems import mark_long
 import jast
 from jast import actions
 from jast import distributions as D
+from jast._src.core.rewards import STANDARD
 
 
 def kinds(dtype):
@@ -205,9 +206,7 @@ def test_searches_draw_from_the_proposal_and_score_by_the_model(key, search):
         cem=dict(samples=40, elites=10, iterations=2),
         mcts=dict(simulations=100),
     )[search]
-    found = getattr(jast.search, search)(
-        key, sim, actions=near, reward=jast._src.core.rewards.STANDARD, **sizes
-    )
+    found = getattr(jast.search, search)(key, sim, actions=near, reward=STANDARD, **sizes)
     assert found.failing_share == 1
     e = found.failures.episodes
     assert (abs(e.disturbances - 0.2) < 0.06).all() and (abs(e.x0) < 0.5).all()

@@ -17,8 +17,9 @@ from systems import TOLD
 import jast
 from jast import blackbox
 from jast._src.blackbox import answers, worker
+from jast._src.core.rewards import STANDARD
 from jast._src.estimate.tilts.replay import numbers_of_episodes
-from jast._src.runtime.host_errors import GROUPS, Log, new_incidents
+from jast._src.runtime.host_errors import GROUPS, Log, new_incidents, sources
 from jast.distributions import Categorical, Independent, Joint, MultivariateNormalDiag, Normal
 from jast.incidents import incidents
 
@@ -58,9 +59,7 @@ class Looks(blackboxes.Walk):
 def test_episodes_are_those_of_the_system_in_jax_and_counted_once(key):
     sim = box(blackboxes.walk, 4)
     ours, theirs = (
-        jast.search.monte_carlo(
-            key, s, episodes=1500, top=3, reward=jast._src.core.rewards.STANDARD
-        )
+        jast.search.monte_carlo(key, s, episodes=1500, top=3, reward=STANDARD)
         for s in (sim, in_jax(episodic=True))
     )
     assert ours.failing_share == theirs.failing_share > 0
@@ -123,7 +122,7 @@ def test_check_says_where_failures_on_the_way_are_lost():
         assert jast.check(sim) is sim
     lost = int(str(said[0].message).split()[2])
     before = blackbox.calls(sim)
-    host = next(jast._src.runtime.host_errors.sources(sim, "compare")).host
+    host = next(sources(sim, "compare")).host
     # the first comes back, the last at the end; the others stay near, or are away at their end
     rows = np.zeros((6, 8))
     rows[5, -2:] = 5, -5

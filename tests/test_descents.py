@@ -31,7 +31,7 @@ from jast._src.estimate.population.particle_moves import (
     record_crossings,
 )
 from jast._src.estimate.population.search import Answer, answer_of
-from jast._src.normal_space.transform import outcomes
+from jast._src.normal_space.transform import episodes, outcomes
 from jast._src.stress_testing import stress
 from jast._src.util.intervals import clopper_pearson
 from jast.estimate import failure_probability, population
@@ -489,7 +489,7 @@ def test_known_failures_and_neighbours_lead_a_proposal(key, monkeypatch):
 
 
 def episodes_of(sim, z):
-    return jax.device_get(jast._src.normal_space.transform.episodes(sim, jnp.asarray(z)))
+    return jax.device_get(episodes(sim, jnp.asarray(z)))
 
 
 def test_a_black_box_keeps_the_thrifty_way(key, monkeypatch):

@@ -10,6 +10,8 @@ from systems import TOLD, mark_long
 from trees import FERRY, grown, problem
 
 import jast
+from jast._src.core.counter_prng import tree_keys
+from jast._src.core.policy import nominal_policy
 from jast._src.search.tree import layout as T
 from jast._src.search.tree import run
 from jast.distributions import Independent, Normal
@@ -81,7 +83,7 @@ def test_an_episode_is_evaluated_once_at_its_end(key):
     assert since(host) == 10
     jast.nominal(key, sim, episodes=300)
     assert since(host) == 300 + 2
-    jast.estimate.importance(key, sim, jast._src.core.policy.nominal_policy(sim), samples=50)
+    jast.estimate.importance(key, sim, nominal_policy(sim), samples=50)
     assert 50 <= since(host) <= 50 + 256
 
 
@@ -298,7 +300,7 @@ def episodes_of(sim, keys, simulations, memoize, **choices):
 
 @pytest.mark.parametrize("memoize", mark_long(["node", "root", "none"], "root", "none"))
 def test_rebuilt_episodes_are_those_of_the_search_whatever_is_kept(key, memoize):
-    sim, keys = needle(), jast._src.core.counter_prng.tree_keys(jax.random.key(3), 2)
+    sim, keys = needle(), tree_keys(jax.random.key(3), 2)
     tree, x = episodes_of(sim, keys, 400, memoize, follow=True, feed=True, urgent=True)
     assert (np.asarray(tree.lead.source) > 0).all()
     fresh = (np.asarray(tree.outcome) & T.FRESH) > 0
@@ -314,7 +316,7 @@ def test_after_a_failure_its_path_grows_step_by_step():
     """Until the next better one: the episodes after it have one step after the other in common with
     it.
     """
-    sim, keys = needle(), jast._src.core.counter_prng.tree_keys(jax.random.key(3), 4)
+    sim, keys = needle(), tree_keys(jax.random.key(3), 4)
     tree, x = episodes_of(sim, keys, 400, "node", follow=True)
     log, failing = np.asarray(tree.log), (np.asarray(tree.outcome) & T.FAILURE) > 0
     leads = 0

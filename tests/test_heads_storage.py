@@ -12,6 +12,7 @@ import pytest
 from jax.tree_util import Partial
 
 import jast
+from jast._src.core.failures import empty
 from jast._src.heads import networks
 from jast._src.heads.heads import policy_logits, predicted_value
 from jast._src.search.tree import run
@@ -319,7 +320,7 @@ def test_load_refuses_other_files(tmp_path):
     path.write_text("levels,3")
     with pytest.raises(ValueError, match="load: .*h is not a file of jast.save"):
         jast.heads.load(path)
-    jast.save(path, jast._src.core.failures.empty(WALK))
+    jast.save(path, empty(WALK))
     with pytest.raises(ValueError, match="load: .*h holds Failures, expected Heads"):
         jast.heads.load(path)
     with pytest.raises(FileNotFoundError):

@@ -9,6 +9,7 @@ import pytest
 from systems import above
 
 import jast
+from jast._src.core.policy import nominal_policy
 from jast._src.runtime import memory
 from jast._src.search.tree import memory as of_trees
 
@@ -83,7 +84,7 @@ CALLS = {
     "subset_simulation": lambda key: jast.estimate.subset_simulation(key, fresh(), samples=5000),
     "failure_proposal": lambda key: jast.estimate.failure_proposal(key, fresh(), samples=5000),
     "log_weights": lambda key: jast.estimate.log_weights(
-        key, fresh(), jast._src.core.policy.nominal_policy(fresh()), 5000
+        key, fresh(), nominal_policy(fresh()), 5000
     ),
     "forest": lambda key: jast.search.forest(
         key, fresh(), trees=50, prunes=2, simulations=50, available=10**10
@@ -100,7 +101,7 @@ def test_what_does_not_fit_says_so_before_it_starts(name, monkeypatch, key):
 
 def test_failure_samples_that_do_not_fit(monkeypatch, key):
     monkeypatch.setattr(memory, "available", lambda: 50_000)
-    q = jast._src.core.policy.nominal_policy(fresh())
+    q = nominal_policy(fresh())
     with pytest.raises(ValueError, match="failure_samples: 10000 episodes at once .* 50 kB"):
         jast.estimate.failure_samples(key, fresh(), q, 1000)
 

@@ -15,6 +15,7 @@ from browser import Page, browsed
 from reports import EVIL, SIM, estimate, made
 
 import jast
+from jast._src.core.failures import empty
 from jast._src.page import document, episode_data, report
 from jast._src.search.refine.modes import Modes
 from jast._src.stress_testing.report_words import share_of_runs, two_digits
@@ -208,7 +209,7 @@ def test_the_verdict_says_whether_to_believe_it(tmp_path):
     p = estimate(warnings=(EVIL,))
     blank = p._replace(log_mean=np.nan, reliable=False, relative_error=np.nan, interval=(0, 0.003))
     quiet = made().nominal.undisturbed._replace(failure=np.True_)
-    none = made(failures=jast._src.core.failures.empty(SIM), modes=Modes())
+    none = made(failures=empty(SIM), modes=Modes())
     cases = {
         "No failure was found in 14": none,
         "fails without any disturbance": made(nominal=made().nominal._replace(undisturbed=quiet)),
@@ -292,7 +293,7 @@ def test_a_report_in_a_cell_of_a_notebook(monkeypatch):
     assert "UNRELIABLE" in doubtful
     assert "&lt;script&gt;fail()" in doubtful
     assert EVIL not in doubtful
-    none = made(failures=jast._src.core.failures.empty(SIM), modes=Modes())._repr_html_()
+    none = made(failures=empty(SIM), modes=Modes())._repr_html_()
     assert "No failure was found in 14" in none and "<img" not in none
     monkeypatch.setitem(sys.modules, "matplotlib", None)
     words = made()._repr_html_()

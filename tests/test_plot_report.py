@@ -9,6 +9,7 @@ from reports import EVIL, SIM, estimate, made
 
 import jast
 from jast import plot
+from jast._src.core.failures import empty
 from jast._src.search.refine.modes import Mode, Modes
 from jast.distributions import seeds
 
@@ -74,7 +75,7 @@ def test_without_its_simulator_a_failure_or_an_estimate():
     bare = plot.report(made(sim=None))
     assert [ax.get_ylabel() for ax in bare.axes] == ["disturbance"] * 2
     assert "not estimated" in said(bare)
-    none = plot.report(made(failures=jast._src.core.failures.empty(SIM), modes=Modes()))
+    none = plot.report(made(failures=empty(SIM), modes=Modes()))
     assert not none.axes and any("No failure was found in 14" in word for word in said(none))
     many = Modes(list(made().modes) * 3)
     figure = plot.report(made(modes=many), nominal=0)

@@ -12,6 +12,7 @@ import pytest
 from systems import mark_long
 
 import jast
+from jast._src.core.policy import nominal_policy
 from jast._src.util import display
 
 KEY = jax.random.key(0)
@@ -61,7 +62,7 @@ MAKERS = {
     "nominal": lambda: jast.nominal(KEY, WALK, episodes=500),
     "failure_proposal": lambda: jast.estimate.failure_proposal(KEY, WALK, samples=200),
     "failure_samples": lambda: jast.estimate.failure_samples(
-        KEY, WALK, jast._src.core.policy.nominal_policy(WALK), 5, moves=1
+        KEY, WALK, nominal_policy(WALK), 5, moves=1
     ),
     "sac": lambda: jast.policies.sac(KEY, WALK, episodes=400, lanes=16, hidden=(8,)),
     "validation": validation,
@@ -70,7 +71,7 @@ OTHERS = {
     "episode": lambda: made("monte_carlo").best,
     "failures": lambda: made("monte_carlo").failures,
     "simulator": lambda: WALK,
-    "policy": lambda: jast._src.core.policy.nominal_policy(WALK),
+    "policy": lambda: nominal_policy(WALK),
     "proposal": lambda: jast.estimate.trace_proposal(WALK, made("monte_carlo").best),
     "heads": heads,
     "traces": lambda: jast.estimate.log_weights(KEY, WALK, OTHERS["policy"](), 20),

@@ -12,6 +12,7 @@ from systems import ring, walk
 
 import jast
 from jast import distributions as D
+from jast._src.core.rewards import STANDARD
 from jast._src.core.signature import Offer, ask, signature_of
 from jast._src.core.transition import begin
 from jast._src.util.pytrees import count_numbers
@@ -193,7 +194,7 @@ def test_precision():
             signature = signature_of(sim)
             assert (signature.dtype, signature.x.dtype, signature.state.dtype) == (dtype,) * 3
             assert not signature.state.weak_type
-            began = jax.eval_shape(lambda: begin(sim, jast._src.core.rewards.STANDARD, ()))
+            began = jax.eval_shape(lambda: begin(sim, STANDARD, ()))
             assert {a.dtype for a in began[:4]} == {jnp.dtype(dtype)}
 
 

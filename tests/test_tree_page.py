@@ -7,6 +7,7 @@ from browser import Page, browsed
 from systems import TOLD, ring, walk
 
 import jast
+from jast._src.core.signature import signature_of
 from jast._src.page.tree_nodes import nodes_of
 
 CASES = {
@@ -61,7 +62,7 @@ def test_what_is_kept_is_the_tree(name, found):
             assert nodes.visits[n] == 1 + nodes.visits[nodes.children(n)].sum()
         assert nodes.failing[0] == (trees.failure & (trees.visits > 0))[:, lane].sum()
     archive, seen = result.failures, 0
-    start = jast._src.core.signature.signature_of(sim).random_start
+    start = signature_of(sim).random_start
     for i, episode in enumerate(archive):
         lane, simulation = int(archive.tree[i]), int(archive.simulation[i])
         if lane < 0:

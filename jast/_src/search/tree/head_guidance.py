@@ -7,6 +7,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from jast import distributions as D
 from jast._src.distributions.flat_rows import flat, unflat
@@ -15,9 +16,9 @@ from jast._src.heads.heads import observation, policy_logits, predicted_value, s
 __all__ = ["Guide", "child_value", "guide", "rolled"]
 
 
-_SHARE = jnp.uint32(1 << 31)
+_SHARE = np.uint32(1 << 31)
 """Address apart from those of levels."""
-_HEAD = jnp.uint32(1)
+_HEAD = np.uint32(1)
 """Address apart from that of what is drawn without heads."""
 
 

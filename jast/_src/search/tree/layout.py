@@ -72,7 +72,7 @@ LINK = VISITS + PAGE
 ROW = 4 * (PAGE + 1)  # numbers of a row: four columns
 
 FAILURE, FRESH, INVALID, RAN = 1, 2, 4, 8  # bits of Tree.outcome
-_NODE = jnp.uint32(1 << 31)  # addresses of children, apart from those of simulations
+_NODE = np.uint32(1 << 31)  # addresses of children, apart from those of simulations
 
 
 class Settings(NamedTuple):
