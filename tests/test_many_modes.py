@@ -37,24 +37,24 @@ def corner():
     return limit_state(_two, 8)
 
 
-def test_numbers_that_a_failure_does_not_need_are_zeroed(key):
+def test_numbers_that_a_failure_does_not_need_are_zeroed():
     """All stay failures, none moves out, and nearly all of the six others come to 0: each is tried
     12 times together with half or a quarter of the others, and a try with neither of the first two
     in it succeeds, so a number is left at the most with (1 - 1/8)^9 (1 - 9/64)^9 = .08.
     """
     sim, z = corner(), np.random.default_rng(0).normal(size=(40, 8)).astype(FLOAT)
     z[:, :2] = 3.5
-    sampler = PopulationSampler(key, sim, 40)
+    sampler = PopulationSampler(np.random.default_rng(0), sim, 40)
     rested = sampler.zero_unneeded(sampler.simulate(z), 18)
     assert (rested.score == -np.inf).all() and (rested.z[:, :2] == 3.5).all()
     left = (rested.z[:, 2:] != 0).mean()
     assert left < 0.08 + 4 * math.sqrt(0.08 * 0.92 / 240) and sampler.evaluations == 40 * 19
 
 
-def test_what_needs_all_its_numbers_is_left_alone(key):
+def test_what_needs_all_its_numbers_is_left_alone():
     """No try succeeds, so there are only a few."""
     z = np.full((20, 8), 3.0 / math.sqrt(8) + 1e-3, FLOAT)
-    sampler = PopulationSampler(key, limit_state(_sum, 8), 20)
+    sampler = PopulationSampler(np.random.default_rng(0), limit_state(_sum, 8), 20)
     population = sampler.simulate(z)
     assert (sampler.zero_unneeded(population, 18).z == z).all() and sampler.evaluations == 20 * 5
 

@@ -116,9 +116,9 @@ def test_a_plane_of_a_hundred_numbers(budget, gradients, error):
 def test_wide_noise_has_a_tenth_of_failures_beyond_a_plane():
     """Within 4 standard errors of a binomial share of 2000 draws."""
     rng = np.random.default_rng(0)
-    z, used, width = draw_wide(rng, planes(3.5), 2000, norm.logsf(3.5))
-    assert width == pytest.approx(3.5 / norm.isf(0.1)) and (used == 60).all()
-    assert abs(len(z) / 2000 - 0.1) < 4 * np.sqrt(0.1 * 0.9 / 2000)
+    failures, width = draw_wide(rng, planes(3.5), 2000, norm.logsf(3.5))
+    assert width == pytest.approx(3.5 / norm.isf(0.1)) and (failures.used == 60).all()
+    assert abs(len(failures.z) / 2000 - 0.1) < 4 * np.sqrt(0.1 * 0.9 / 2000)
 
 
 def test_the_audit_by_wide_noise_tells_of_another_plane():

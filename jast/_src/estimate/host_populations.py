@@ -109,8 +109,8 @@ class PopulationSampler:
     `explore`.
     """
 
-    def __init__(self, key, sim, size, covered=None):
-        self.rng, self.sim = numpy_generator(key), sim
+    def __init__(self, rng, sim, size, covered=None):
+        self.rng, self.sim = rng, sim
         self.size, self.covered = size, covered
         self.scale, self.accepted = FIRST_SCALE, math.nan
         self.evaluations = self.invalid = 0
@@ -193,7 +193,7 @@ def explore(key, sim, size, *, covered=None, min_log_probability=-math.inf, max_
     It stops below ``min_log_probability``, where it would take more than ``max_evaluations``, and
     where no level falls further.
     """
-    sampler = PopulationSampler(key, sim, size, covered)
+    sampler = PopulationSampler(numpy_generator(key), sim, size, covered)
     population = sampler.draw(1.0)
     level, levels = math.inf, []
     log_mean, complete = 0.0, True
@@ -238,7 +238,7 @@ def draw_wide_failures(key, sim, n, *, covered=None):
     `FAILING_SHARE` of some ``n`` draws fails, or at the last: (`Population` [m] of them, s, what
     drew them). ``covered`` as in `explore`.
     """
-    sampler = PopulationSampler(key, sim, -(-n // DRAWS_PER_POINT), covered)
+    sampler = PopulationSampler(numpy_generator(key), sim, -(-n // DRAWS_PER_POINT), covered)
     for width in WIDTHS:
         drawn = [sampler.draw(width) for _ in range(DRAWS_PER_POINT)]
         population = Population(*map(np.concatenate, zip(*drawn, strict=True)))
@@ -248,17 +248,17 @@ def draw_wide_failures(key, sim, n, *, covered=None):
     return population.take(failing), width, sampler
 
 
-def draw_wide(rng, sim, n, log_mean):
+def draw_wide(rng, sim, n, log_mean, *, covered=None):
     """The failures among ``n`` draws of noise so wide that a half-space with the probability of
-    ``log_mean`` has `FAILING_SHARE` of them: (z [m, D], the numbers that each used [m], the width).
-    Of a tenth of that probability it has nearly as many: .067 of the draws for 2e-4, .086 for 1e-8.
+    ``log_mean`` has `FAILING_SHARE` of them: (`Population` [m], the width). ``covered`` as in
+    `explore`. Of a tenth of that probability it has nearly as many: .067 of the draws for 2e-4,
+    .086 for 1e-8.
     """
-    from scipy.special import ndtri  # here: slow to import
+    from scipy.special import ndtri, ndtri_exp  # here: slow to import
 
-    width = max(float(ndtri(math.exp(min(log_mean, 0.0))) / ndtri(FAILING_SHARE)), 1.0)
-    z = (width * rng.standard_normal((n, dimension(sim)))).astype(normal_numbers(sim))
-    o = evaluate_points(sim, z)
-    return z[o.failure], np.asarray(o.used)[o.failure], width
+    width = max(float(ndtri_exp(min(log_mean, 0.0)) / ndtri(FAILING_SHARE)), 1.0)
+    population = PopulationSampler(rng, sim, n, covered).draw(width)
+    return population.take(population.score == -np.inf), width
 
 
 def bracket_boundary(key, sim, n):
@@ -304,7 +304,7 @@ def equilibrate(key, sim, points, moves, *, covered=None, max_evaluations=0):
     `explore`.
     """
     n = len(points)
-    sampler = PopulationSampler(key, sim, n, covered)
+    sampler = PopulationSampler(numpy_generator(key), sim, n, covered)
     failures = sampler.simulate(np.asarray(points, sampler.dtype))
     norm = (failures.z**2).sum()
     while True:

@@ -132,8 +132,9 @@ def _approach_wide(f, state, planes, gradients, end):
     n = f.settings.wide_audit
     if state.spent + n > end:
         return state, planes
-    z, _, width = draw_wide(f.context.rng, f.sim, n, np.logaddexp.reduce(planes.log_mass))
-    state, tried = state.note(f"moments: {len(z)} fail under {width:.2f} times wider noise", n), 0
+    failures, width = draw_wide(f.context.rng, f.sim, n, np.logaddexp.reduce(planes.log_mass))
+    z, tried = failures.z, 0
+    state = state.note(f"moments: {len(z)} fail under {width:.2f} times wider noise", n)
     for point in z.astype(np.float64):
         if tried < GIVEN and not (planes.normal @ point > planes.depth - KNOWN).any():
             state, planes = _approach(f, state, planes, INSIDE * point, gradients, end)

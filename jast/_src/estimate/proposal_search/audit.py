@@ -24,6 +24,7 @@ from jast._src.estimate.proposal_search.search_state import (
     failure_log_ratios,
     pooled_log_ratio,
 )
+from jast._src.normal_space.transform import dimension
 
 __all__ = ["audit_proposal", "uncovered"]
 
@@ -41,24 +42,29 @@ class Missing(NamedTuple):
     """Their probability, as a multiple of what the proposal found; nan where nobody knows"""
     points: Any
     """[m] of its `Family`"""
+    by_chance: bool = False
+    """So few failures that a proposal may be right without them: they are absorbed, while there
+    is room, but are no reason against it"""
 
 
 def audit_proposal(family: Family, state: SearchState) -> SearchState:
     """The state after the audits. The proposal absorbs what they find, is fitted anew and audited
     again; what the last one finds becomes a reason against the estimate.
     """
-    state, cooled = _equilibrate_cooled(family, state)
     settings = family.settings
+    state, cooled = _equilibrate_cooled(family, _add_wide_failures(family, state))
     end = settings.search_end * family.budget
     for left in reversed(range(settings.audits)):
         state = state._replace(reasons=())  # what is still wrong is said again
         wide = _affords_wide_noise(family, state) and not _population_size(family, state)
         if wide:
-            state, cooled = _equilibrate_cooled(family, _draw_widely(family, state))
+            state = _draw_widely(family, state, settings.wide_audit)
+            state, cooled = _equilibrate_cooled(family, state)
         state, missing = _missing(family, state, cooled, wide)
-        if not missing:
+        last = wide or not left or state.spent + LEAST_BATCHES * family.batch > end
+        if not (missing := [m for m in missing if not (last and m.by_chance)]):
             break
-        if wide or not left or state.spent + LEAST_BATCHES * family.batch > end:
+        if last:
             return _check_given(family, _report(state, missing))
         state = _absorb(family, state, missing)
         state = adapt_proposal(family, state, settings.audit_refits, end)
@@ -126,14 +132,31 @@ def _affords_wide_noise(family, state):
     return bool(s.wide_audit) and _room(family, state) > s.wide_audit + s.burn_in_moves
 
 
-def _draw_widely(family, state):
-    """The state with the uncovered failures among draws of wide noise."""
-    n = family.settings.wide_audit
-    z, used, width = draw_wide(family.context.rng, family.sim, n, state.log_mean)
-    state, points = family.as_points(state, z, used)
-    rows = uncovered(family, state, points)
-    text = f"audit: {rows.sum()} of {len(rows)} failures under {width:.2f} times wider noise"
-    return state.note(f"{text} not covered", n)._replace(cooled=z[rows])
+def _draw_widely(family, state, n):
+    """The state with the uncovered failures among ``n`` draws of wide noise."""
+    outside = family.exclusion(state.q, _coverage_threshold(family, state))
+    log_mean, rng = state.log_mean, family.context.rng
+    failures, width = draw_wide(rng, family.sim, n, log_mean, covered=outside)
+    text = f"audit: {len(failures.z)} of {n} draws of {width:.2f} times wider noise not covered"
+    return state.note(text, n)._replace(cooled=failures.z)
+
+
+def _has_few_numbers(family):
+    """Whether wide noise comes to islands of failures, and moves lead from there to where the model
+    has them.
+    """
+    return dimension(family.sim) < family.settings.moments_numbers
+
+
+def _add_wide_failures(family, state):
+    """The state, of a system of few numbers with the uncovered failures of wide noise before those
+    that it knows: levels of the miss distance pass by an island of failures.
+    """
+    if not _has_few_numbers(family):
+        return state
+    known = state.cooled
+    state = _draw_widely(family, state, int(family.settings.wide_share * family.budget))
+    return state if known is None else state._replace(cooled=np.concatenate([state.cooled, known]))
 
 
 def _missing(family, state, cooled, wide):
@@ -153,8 +176,10 @@ def _missing(family, state, cooled, wide):
     if cooled is not None:
         rows = _unseen(family, state, cooled)
         state = state.note(f"audit: {rows.sum()} of {len(rows)} failures moved not covered")
-        if rows.sum() > max(settings.stray_share * len(rows), settings.stray_count):
-            missing.append(Missing(math.nan, family.select(cooled, rows)))
+        most = max(settings.stray_share * len(rows), settings.stray_count)
+        by_chance = rows.sum() <= most
+        if not by_chance or (rows.any() and _has_few_numbers(family)):
+            missing.append(Missing(math.nan, family.select(cooled, rows), by_chance))
     return state, missing
 
 
