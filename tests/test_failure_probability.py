@@ -213,6 +213,7 @@ def test_no_failure(key):
     assert found.evaluations <= BUDGET
     assert found.interval[0] == 0 < found.interval[1] < 1e-3
     assert str(found).startswith("UNRELIABLE: no failure in")
+    assert "if no invalid episode fails" in str(found)
     assert found.invalid >= found.samples
     with pytest.raises(ValueError, match="failure_samples: source must hold a proposal, received"):
         failure_samples(key, sim, found)

@@ -25,8 +25,9 @@ MAX_K_HAT = 0.7
 """Pareto shape above which no standard error is trusted (Vehtari and others 2024)."""
 MIN_ESS = 100
 """Effective draws of an estimate: a relative standard error of a tenth. A convention."""
-MAX_WEIGHT_SHARE = 0.05
-"""Part of an estimate that one episode may carry. A convention."""
+MAX_SHARE_OF_ERROR = 0.5
+"""Part of an estimate that one episode may carry, as a multiple of the relative standard error of
+the least effective draws: 5 % where these are 100. A convention."""
 MIN_ESS_PER_FAILURE = 0.01
 """Effective draws a failure: of a proposal below it the weights hardly overlap. A convention."""
 MIN_MODE_SHARE = 0.02
@@ -120,7 +121,9 @@ def mode_warnings(shares: np.ndarray, sizes: np.ndarray, error: float) -> list[s
 def weight_warnings(
     failures: int, ess: float, k_hat: float, max_share: float, min_ess: int = MIN_ESS
 ) -> list[str]:
-    """Why weights must not be trusted: a list of texts, empty where nothing speaks against them."""
+    """Why weights must not be trusted: a list of texts, empty where nothing speaks against them.
+    ``min_ess``: the least effective draws.
+    """
     found = []
     if ess < min_ess:
         found.append(f"effective sample size {ess:.3g}, below {min_ess}")
@@ -131,10 +134,8 @@ def weight_warnings(
             f"Pareto k-hat {k_hat:.2f}, above {MAX_K_HAT}: the weights have so heavy a tail that"
             " their standard error cannot be trusted"
         )
-    if max_share > MAX_WEIGHT_SHARE:
-        found.append(
-            f"one episode carries {max_share:.0%} of the estimate, above {MAX_WEIGHT_SHARE:.0%}"
-        )
+    if max_share > (most := MAX_SHARE_OF_ERROR / math.sqrt(min_ess)):
+        found.append(f"one episode carries {max_share:.0%} of the estimate, above {most:.0%}")
     if ess < MIN_ESS_PER_FAILURE * failures:
         found.append(
             f"effective sample size {ess:.3g} is below {MIN_ESS_PER_FAILURE:.0%} of the {failures}"

@@ -150,7 +150,8 @@ class Estimate(NamedTuple):
         rows = [*self._probability_rows()]
         if self.chernoff is not None:
             bounds = f"{self.chernoff:.4g} (Chernoff)   {self.jeffreys:.4g} (Jeffreys)  "
-            rows.append(("upper bounds", f"{bounds} one-sided {self.level:.4g}"))
+            given = ", if no invalid episode fails" if self.invalid else ""
+            rows.append(("upper bounds", f"{bounds} one-sided {self.level:.4g}{given}"))
         counts = f"{self.failing} of {self.samples} episodes   {self.episodes} evaluations"
         rows.append(("failures", counts))
         if self.chernoff is None and self.failing and not math.isnan(self.max_share):
