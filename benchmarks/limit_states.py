@@ -85,6 +85,12 @@ def sphere(centre, radius, side, x, np=jnp):
     return side * (radius**2 - np.sum((x - centre) ** 2, axis=-1)) / (2 * radius)
 
 
+def plane_and_ball(direction, beta, centre, radius, x, np=jnp):
+    """Fails beyond a plane, and inside of a sphere."""
+    beyond = beta - np.sum(direction * x, axis=-1)
+    return np.minimum(beyond, sphere(centre, radius, -1.0, x, np))
+
+
 def four_branch(p, k, x, np=jnp):
     """The four-branch series system: p = 7, k = 3 in the literature."""
     across, along = (x[..., 0] - x[..., 1]), (x[..., 0] + x[..., 1]) / 2**0.5
@@ -312,6 +318,21 @@ def inside(rng, P):
     return _sphere(rng, offset, radius, -1, d)
 
 
+def islands(rng, P):
+    """A plane, and on its other side a ball with 3 to 30 % of the mass, aslant of the mirror image
+    of what is nearest of the plane. They are apart.
+    """
+    d = int(rng.choice((2, 3, 5)))
+    share, radius = rng.uniform(0.03, 0.3), d**0.5 * rng.uniform(0.6, 1.0)
+    ball = share * P
+    offset = _solve(lambda c: sphere_probability(c, radius, -1, d), ball, 0.0, 14.0)
+    u, v = np.linalg.qr(rng.normal(size=(d, 2)))[0].T
+    beta = stats.norm.isf(P - ball)
+    parameters = u, beta, -offset * (u + v) / 2**0.5, radius
+    truth = P - ball + sphere_probability(offset, radius, -1, d)
+    return Limit(plane_and_ball, parameters, d, truth)
+
+
 def branches(rng, P):
     """Four branches: two curved ones, and two planes with 10 to 90 % of the mass."""
     p = 2 * stats.norm.isf(P * rng.uniform(0.1, 0.9) / 2)
@@ -363,6 +384,7 @@ FAMILIES = {
         curved,
         outside,
         inside,
+        islands,
         branches,
         landings,
         walks,
