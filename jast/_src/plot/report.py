@@ -226,7 +226,7 @@ def _draw_modes(page: _Page, report: Any, sim: Any, shown: list, nominal: Any, u
         facts = "   ".join(f"{name} {value}" for name, value in mode_facts(report, k, failure))
         colour = style.look(k)[0]
         page.words(MARGIN, f"Mode {k + 1}", -0.12, weight="bold", fontsize=9, color=colour)
-        page.words(MARGIN + 0.65, facts, -0.12, fontsize=8.5)
+        page.words(MARGIN + 0.65, facts, -0.12, fontsize=7.5)
         _draw_mode(page, sim, owned, failure, k, units, legend=k == 0)
         page.y += MODE
 
