@@ -45,6 +45,12 @@ MARK = "the_users_step"
 TIMES = ("jaxpr_trace_duration", "jaxpr_to_mlir_module_duration", "backend_compile_duration")
 LANES = 128  # episodes side by side
 TIMES_PLAYED = 10  # after compilation
+IMPORTED = {
+    "import jast": "import jast",
+    "jast.Simulator and distributions": "import jast; jast.Simulator, jast.distributions.Normal",
+    "jast.stress": "import jast; jast.stress",
+}
+"""What is loaded when it is first asked for, beside ``import jax``."""
 IMPORTS = 5
 """Fresh processes, of which the quickest counts."""
 
@@ -139,14 +145,6 @@ def ways(make: Callable) -> list[tuple[float, float]]:
         seconds = (time.process_time() - begin) / (TIMES_PLAYED * LANES)
         rows.append((compiled, seconds * 1e6))
     return rows
-
-
-IMPORTED = {
-    "import jast": "import jast",
-    "jast.Simulator and distributions": "import jast; jast.Simulator, jast.distributions.Normal",
-    "jast.stress": "import jast; jast.stress",
-}
-"""What is loaded when it is first asked for, beside ``import jax``."""
 
 
 def loading(code: str, times: int) -> float:

@@ -149,8 +149,9 @@ def _has_few_numbers(family):
 
 
 def _add_wide_failures(family, state):
-    """The state, of a system of few numbers with the uncovered failures of wide noise before those
-    that it knows: levels of the miss distance pass by an island of failures.
+    """The state of a system of few numbers, with the uncovered failures of wide noise before those
+    that it knows: levels of the miss distance pass by an island of failures. Any other state as it
+    is.
     """
     if not _has_few_numbers(family):
         return state
@@ -176,8 +177,7 @@ def _missing(family, state, cooled, wide):
     if cooled is not None:
         rows = _unseen(family, state, cooled)
         state = state.note(f"audit: {rows.sum()} of {len(rows)} failures moved not covered")
-        most = max(settings.stray_share * len(rows), settings.stray_count)
-        by_chance = rows.sum() <= most
+        by_chance = rows.sum() <= max(settings.stray_share * len(rows), settings.stray_count)
         if not by_chance or (rows.any() and _has_few_numbers(family)):
             missing.append(Missing(math.nan, family.select(cooled, rows), by_chance))
     return state, missing
