@@ -1,15 +1,15 @@
 """Episodes that a CPU second buys: ``python -m benchmarks.rates [--json] [--quick | --smoke]
-[--systems NAME ...]``.
+[--systems NAME ...] [--methods NAME ...] [--evaluations N]``.
 
 `jast.estimate.monte_carlo`, `jast.estimate.failure_probability` and `jast.stress`, the last two
-with 2,097,152 evaluations, beside a minimal loop in one program: blocks of 128 vectors of normal
-numbers by `jax.random.normal`, put through ``step`` and ``evaluate`` and counted. All were compiled
-before (the second call of each is timed), and all in this process, one after the other.
+with 2,097,152 evaluations (or all with ``--evaluations``), beside a minimal loop in one program:
+blocks of vectors of normal numbers by `jax.random.normal`, put through ``step`` and ``evaluate``
+and counted. All were compiled before (the second call of each is timed), and all in this process,
+one after the other. On an accelerator seconds are those of the clock on the wall.
 """
 
-import time
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 
 import jax
@@ -18,14 +18,15 @@ from jax import lax
 
 import jast
 from benchmarks.closed_loops import JUDGED, RARE, TUNED
-from benchmarks.sizes import add_choices, options, print_report, printer, size
+from benchmarks.sizes import add_choices, options, print_report, printer, seconds, size
+from jast._src.runtime.device import block_size
 
 __all__ = ["SYSTEMS", "rates"]
 
 SYSTEMS = {a.name: a.simulator for a in (*TUNED, *JUDGED, *RARE) if a.name not in ("camera", "arm")}
 """Closed loops all of whose random numbers are standard normal ones"""
-BLOCK = 128
-"""Episodes that the minimal loop runs side by side."""
+WIDEST = 2**17
+"""Episodes that the minimal loop runs side by side at most: on a CPU it takes 128."""
 EVALUATIONS = 2**21
 METHODS = ("monte_carlo", "failure_probability", "stress")
 
@@ -33,13 +34,14 @@ METHODS = ("monte_carlo", "failure_probability", "stress")
 @partial(jax.jit, static_argnames="blocks")
 def minimal_loop(key: jax.Array, sim: jast.Simulator, blocks: int) -> jax.Array:
     """Failures among so many blocks of episodes."""
+    block_of = block_size(WIDEST)
     start = sim.init(sim.start().sample(seed=key))
     like = sim.disturbance(start).sample(seed=key)
-    every = jax.tree.map(lambda a: jnp.broadcast_to(a, (BLOCK, *jnp.shape(a))), start)
+    every = jax.tree.map(lambda a: jnp.broadcast_to(a, (block_of, *jnp.shape(a))), start)
 
     def block(i, count):
         own = jax.random.fold_in(key, i)
-        noise = jax.random.normal(own, (sim.horizon, BLOCK, *like.shape), like.dtype)
+        noise = jax.random.normal(own, (sim.horizon, block_of, *like.shape), like.dtype)
 
         def step(carry, w):
             state, failed, over = carry
@@ -47,7 +49,7 @@ def minimal_loop(key: jax.Array, sim: jast.Simulator, blocks: int) -> jax.Array:
             failed = failed | (~over & jax.vmap(sim.evaluate)(state)[0])
             return (state, failed, over | failed | jax.vmap(sim.is_terminal)(state)), None
 
-        none = jnp.zeros(BLOCK, bool)
+        none = jnp.zeros(block_of, bool)
         failed = lax.scan(step, (every, none, none), noise)[0][1]
         return count + jnp.sum(failed, dtype=jnp.int32)
 
@@ -57,18 +59,20 @@ def minimal_loop(key: jax.Array, sim: jast.Simulator, blocks: int) -> jax.Array:
 def _rate(work: Callable[[int], float]) -> float:
     """Episodes a CPU second of ``work(seed)``, which says how many it ran, by its second call."""
     work(0)
-    begun = time.process_time()
+    begun = seconds()
     done = work(1)
-    return done / (time.process_time() - begun)
+    return done / (seconds() - begun)
 
 
-def rates(sim: jast.Simulator, episodes: int, evaluations: int) -> dict[str, float]:
+def rates(
+    sim: jast.Simulator, episodes: int, evaluations: int, methods: Sequence[str] = METHODS
+) -> dict[str, float]:
     """Episodes a CPU second of the minimal loop, and the share of it that each method reaches."""
-    blocks = max(episodes // BLOCK, 1)
+    blocks = max(episodes // block_size(WIDEST), 1)
 
     def loop(seed):
         minimal_loop(jax.random.key(seed), sim, blocks).block_until_ready()
-        return blocks * BLOCK
+        return blocks * block_size(WIDEST)
 
     calls = dict(
         monte_carlo=lambda key: jast.estimate.monte_carlo(key, sim, episodes).evaluations,
@@ -78,21 +82,26 @@ def rates(sim: jast.Simulator, episodes: int, evaluations: int) -> dict[str, flo
         stress=lambda key: jast.stress(key, sim, evaluations).episodes,
     )
     alone = _rate(loop)
-    shares = {m: _rate(lambda seed, m=m: calls[m](jax.random.key(seed))) / alone for m in METHODS}
+    shares = {m: _rate(lambda seed, m=m: calls[m](jax.random.key(seed))) / alone for m in methods}
     return dict(minimal_loop=alone, **shares)
 
 
 def main(argv: list[str] | None = None) -> None:
     parser = options(__doc__, "three systems")
     add_choices(parser, "--systems", SYSTEMS)
+    add_choices(parser, "--methods", METHODS)
+    parser.add_argument("--evaluations", type=int, help="of each method")
     args = parser.parse_args(argv)
     names = args.systems or size(args, list(SYSTEMS), ["drone", "grid", "cart-pole"], ["grid"])
     episodes, evaluations = size(args, (2**20, EVALUATIONS), (2**19, EVALUATIONS), (2**12, 2**12))
+    if args.evaluations:
+        episodes = evaluations = args.evaluations
+    methods = args.methods or METHODS
     say, rows = printer(args), []
     for name in names:
         with warnings.catch_warnings(action="ignore"):
-            rows.append(dict(system=name, **rates(SYSTEMS[name], episodes, evaluations)))
-        shares = "  ".join(f"{m} {rows[-1][m]:.3f}" for m in METHODS)
+            rows.append(dict(system=name, **rates(SYSTEMS[name], episodes, evaluations, methods)))
+        shares = "  ".join(f"{m} {rows[-1][m]:.3f}" for m in methods)
         say(f"{name:12s} minimal loop {rows[-1]['minimal_loop']:9.0f} a CPU second; {shares}")
     print_report(args, dict(episodes=episodes, evaluations=evaluations, rows=rows))
 

@@ -13,6 +13,8 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 import jast
 from jast._src.runtime._jax import (
+    _REFUSED,
+    _compiled,
     custom_vmap,
     define_prng_impl,
     host_call,
@@ -190,3 +192,28 @@ def test_derivatives_go_through_stops():
     for function, slope in ((stopped, 0.0), (without_stops(stopped), 60.0)):
         of_x = lambda x, f=function: f(start | {"x": x}, 5.0)["x"]
         np.testing.assert_allclose(jax.jit(jax.vmap(jax.grad(of_x)))(jnp.full(3, 2.0)), slope)
+
+
+def test_an_option_that_the_compiler_does_not_know_is_left_out():
+    """Another version of XLA knows other options: the program is compiled without."""
+    options = {"xla_no_such_option_of_any_version": True, "xla_backend_optimization_level": "0"}
+    double = _compiled(lambda x: 2 * x, lambda: True, options, {})
+    assert double(np.float32(3)) == 6
+    assert "xla_no_such_option_of_any_version" in _REFUSED
+    assert "xla_backend_optimization_level" not in _REFUSED
+
+
+def test_an_error_of_the_program_stays():
+    """It names no option."""
+
+    def fail(x):
+        raise RuntimeError("of the host")
+
+    program = _compiled(
+        lambda x: jax.pure_callback(fail, jax.ShapeDtypeStruct((), np.float32), x),
+        lambda: True,
+        {"xla_backend_optimization_level": "0"},
+        {},
+    )
+    with pytest.raises(jax.errors.JaxRuntimeError, match="of the host"):
+        jax.block_until_ready(program(np.float32(1)))

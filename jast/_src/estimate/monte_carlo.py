@@ -19,12 +19,13 @@ from jast._src.core.simulator import Simulator
 from jast._src.core.typing import Callback, Executor, PathLike, PRNGKey
 from jast._src.estimate.estimate import Estimate, estimate_from_counts
 from jast._src.estimate.importance_sampling import Traces, chunks
-from jast._src.estimate.proposal_search.mixture_draws import plain_chunk, rows_of
+from jast._src.estimate.proposal_search.mixture_draws import plain_chunk, plain_parts, rows_of
 from jast._src.estimate.weighted_draws import with_source
-from jast._src.normal_space.evaluate_points import evaluate_points
+from jast._src.normal_space.evaluate_points import evaluate_on_device, evaluate_points
 from jast._src.runtime import work
 from jast._src.runtime._jax import jit
 from jast._src.runtime.checkpoints import open_checkpoint
+from jast._src.runtime.device import block_size
 from jast._src.runtime.host_errors import runs_on_host
 from jast._src.runtime.progress_bar import Watch
 from jast._src.util.checks import check_random_key, whole_number
@@ -35,8 +36,6 @@ __all__ = ["episode_keys", "lanes_of_points", "monte_carlo", "simulate_points"]
 
 CHUNK_EPISODES = 16384
 """Episodes of a unit of work that are drawn by keys: a second of a cheap system, or less."""
-BLOCK_EPISODES = 128
-"""Episodes that run side by side: their states then stay in the caches of a core."""
 
 
 def monte_carlo(
@@ -115,7 +114,13 @@ def simulate_points(shared: tuple[Any, ...], i: int, context: Any) -> Traces:
     `normal_space.evaluate_points`.
     """
     key, sim, lanes, samples = shared
-    o = evaluate_points(sim, plain_chunk(key, i, min(lanes, samples - i * lanes), sim))
+    n, m = min(lanes, samples - i * lanes), rows_of(sim)
+    if runs_on_host(sim):
+        o = evaluate_points(sim, plain_chunk(key, i, n, sim))
+    else:
+        parts = enumerate(plain_parts(key, i, n, sim))
+        found = [evaluate_on_device(sim, z, min(m, n - j * m)) for j, z in parts]
+        o = jax.tree.map(lambda *a: np.concatenate(a), *found)
     return _plain_traces(o.failure, o.invalid, o.length, o.distance)
 
 
@@ -128,9 +133,8 @@ def _simulate_keys(shared, i, context):
     """As `simulate_points`, where distributions have no quantile function in closed form."""
     key, sim, lanes, samples = shared
     n = min(lanes, samples - i * lanes)
-    size = (
-        n if runs_on_host(sim) else BLOCK_EPISODES
-    )  # of a system on the host no episode is run in vain
+    # of a system on the host no episode is run in vain
+    size = n if runs_on_host(sim) else block_size(CHUNK_EPISODES)
     out = jax.device_get(_simulate_chunk(jax.random.fold_in(key, i), sim, np.int32(n), size))
     return _plain_traces(*(a[:n] for a in out))
 

@@ -33,6 +33,8 @@ from jax.core import ShapedArray, Tracer
 from jax.custom_batching import custom_vmap
 from jax.interpreters import batching, mlir
 
+from jast._src.runtime.device import on_cpu
+
 __all__ = [
     "briefly",
     "custom_vmap",
@@ -69,6 +71,9 @@ def is_tracing() -> bool:
 #   car .5, .7, 1.6; gymnax CartPole 8.3, 9.8, 35; brax inverted pendulum 255, 281, 1656.
 _BRIEFLY = {"xla_cpu_use_fusion_emitters": False, "xla_cpu_parallel_codegen_split_count": 1}
 _QUICKLY = _BRIEFLY | {"xla_backend_optimization_level": "0"}
+_REFUSED: set[str] = set()
+"""Options that this version of XLA does not know: that of JAX 0.11 has no fusion emitters to turn
+off."""
 _BRIEF = contextvars.ContextVar("brief", default=False)
 
 
@@ -108,15 +113,22 @@ def _compiled(function, wanted, how, options):
     whole = jax.jit(function, **options)
 
     @functools.cache
-    def jitted():
-        # not earlier: this asks for the devices
-        cpu = jax.default_backend() == "cpu"
-        return jax.jit(function, compiler_options=how if cpu else None, **options)
+    def jitted(known):
+        return jax.jit(function, compiler_options=dict(known) or None, **options)
 
     def run(*args, **kwargs):
         # inside of another program there are no options of its own
-        own = wanted() and not is_tracing() and not is_traced(args, kwargs)
-        return (jitted() if own else whole)(*args, **kwargs)
+        if not wanted() or is_tracing() or is_traced(args, kwargs):
+            return whole(*args, **kwargs)
+        while True:
+            known = tuple(p for p in how.items() if p[0] not in _REFUSED) if on_cpu() else ()
+            try:
+                return jitted(known)(*args, **kwargs)
+            except jax.errors.JaxRuntimeError as error:
+                refused = {k for k, _ in known if k in str(error)}
+                if not refused:
+                    raise
+                _REFUSED.update(refused)
 
     run.eval_shape, run.lower = whole.eval_shape, whole.lower
     return functools.wraps(function)(run)

@@ -35,6 +35,7 @@ from jast._src.normal_space import transform
 from jast._src.runtime import work
 from jast._src.runtime._jax import briefly
 from jast._src.runtime.checkpoints import keep_answers, open_checkpoint
+from jast._src.runtime.device import on_cpu, where_few_points_run
 from jast._src.runtime.host_errors import (
     failing_runs,
     runs_apart,
@@ -86,6 +87,9 @@ FEW_MODES = 4
 nothing else: its evaluations are the estimate's."""
 COOLING_SHARE = 0.2
 """Share of the evaluations by which failures of the populations are cooled to the likeliest."""
+COOLING_BESIDE_ACCELERATOR = 2**20
+"""Of them at most where an accelerator simulates: the CPU cools, and takes some five seconds. A
+fifth of what an H100 simulates by default, 33 million, took it thirty."""
 INDEPENDENT_SHARE = 0.25
 """Share of these by which no point replaces another, so that no mode is lost. With all of them the
 likeliest failure of the crossing is .35 nats less likely, of the cart-pole 6, of the ship 4; with
@@ -327,6 +331,8 @@ class _StressTest:
     def run_populations(self):
         """The probability by populations, and the likeliest failures from theirs."""
         cooling = int(COOLING_SHARE * self.budget)
+        if not on_cpu():
+            cooling = min(cooling, COOLING_BESIDE_ACCELERATOR)
         refining = min(REFINE_EVALUATIONS, self.budget // 8)
         rest = self.budget - self.spent - cooling - 2 * refining
         rest = max(rest, MIN_POPULATION_BUDGET // 2)
@@ -346,9 +352,9 @@ class _StressTest:
             ("cooled together", True, 1 - INDEPENDENT_SHARE),
         ):
             self.watch.doing("cooling failures")
-            points, spent = cool_failures(
-                self.next_key(), self.sim, sample.points[rows], int(share * cooling), replace
-            )
+            key, budget = self.next_key(), int(share * cooling)
+            with where_few_points_run():
+                points, spent = cool_failures(key, self.sim, sample.points[rows], budget, replace)
             self.add_failures(name, failures_at(self.sim, points)._replace(evaluations=spent))
         self.parts = BudgetShares(nominal=0, search=0, slow_search=0, refine=refining)
         self.modes_budget = refining // 4

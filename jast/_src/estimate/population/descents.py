@@ -20,7 +20,6 @@ from jast._src.core.simulator import Simulator
 from jast._src.estimate.host_populations import next_level
 from jast._src.estimate.population.particle_moves import (
     AFTER,
-    LANES,
     SMALL,
     WINDOW,
     allocate_particles,
@@ -31,6 +30,7 @@ from jast._src.estimate.population.particle_moves import (
 )
 from jast._src.estimate.proposal_search.mixture_draws import resample
 from jast._src.normal_space.transform import dimension
+from jast._src.runtime.device import BLOCK, on_cpu
 
 __all__ = [
     "DESCENTS",
@@ -52,7 +52,10 @@ class Settings:
     """All numbers of the ways down; `python -m benchmarks.populations` prints what each costs."""
 
     particles: int = 8192
-    """Points of a population."""
+    """Points of a population on a CPU."""
+    accelerated_particles: int = 2**18
+    """Points of one on an accelerator: an H100 moves them in the time of 2^17, 5 ms, and 8192 in
+    2 (``rail`` of `benchmarks.closed_loops`)."""
     moves_by_distance: int = 5
     """Moves of a point between two levels: with half as many the variance of the toy is 2.9 times
     as great at equal cost, with twice as many 1.5 times."""
@@ -147,7 +150,7 @@ class _ParticlePopulation:
 
     def keep_first(self, failing, n):
         """Leave only the first ``n`` independent points, in full blocks; which of them fail."""
-        self.n = int(max(min(n, self.n) // LANES * LANES, LANES))
+        self.n = int(max(min(n, self.n) // BLOCK * BLOCK, BLOCK))
         self.family = np.arange(self.n)
         return failing[: self.n]
 
@@ -228,10 +231,14 @@ class _ParticlePopulation:
         )
 
 
-def population_size(sim: Simulator, particles: int) -> int:
-    """Points of a population of ``sim``: as many as are asked for, if they fit."""
+def population_size(sim: Simulator, particles: int | None = None) -> int:
+    """Points of a population of ``sim``: as many as are asked for, or serve the device, if they
+    fit.
+    """
+    if particles is None:
+        particles = SETTINGS.particles if on_cpu() else SETTINGS.accelerated_particles
     most = SETTINGS.max_numbers // max(dimension(sim), 1)
-    return max(min(particles, most) // LANES * LANES, LANES)
+    return max(min(particles, most) // BLOCK * BLOCK, BLOCK)
 
 
 def by_distance(
@@ -328,7 +335,7 @@ def cool_failures(
     """
     m, rng = len(points), numpy_generator(key, 6)
     rows, steering = np.arange(m), initial_steering()
-    particles = allocate_particles(sim, population_size(sim, SETTINGS.particles))
+    particles = allocate_particles(sim, population_size(sim))
     z = np.zeros(particles.z.shape, particles.z.dtype)
     z[:m] = points
     # all of them fail, and only a failure takes the place of one

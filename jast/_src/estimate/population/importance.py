@@ -21,11 +21,11 @@ from jast._src.estimate.gaussians.family import defensive_parts
 from jast._src.estimate.gaussians.mixture_fit import as_latent, fit_mixture
 from jast._src.estimate.importance_sampling import chunk_size
 from jast._src.estimate.population.failure_sample import sample_from
-from jast._src.estimate.population.particle_moves import LANES
 from jast._src.estimate.population.search import Answer, Kind, PopulationSearch, pool_answers
 from jast._src.estimate.proposal_search.final_draws import draw_estimate
 from jast._src.estimate.proposal_search.mixture_draws import log_ratio
 from jast._src.normal_space.transform import Latent, dimension, normal_numbers
+from jast._src.runtime.device import BLOCK
 from jast._src.runtime.progress_bar import Watch
 
 __all__ = ["importance_estimate"]
@@ -65,7 +65,7 @@ def importance_estimate(
     promise as much with what is left of the budget, and where its own weights speak against it.
     """
     left = (search.budget - search.spent) * PILOT_DIVISOR // (PILOT_DIVISOR + 1)
-    if left < LANES:
+    if left < BLOCK:
         return None
     copies = 2  # of each component there is a wide copy
     affordable = MAX_PRODUCTS / (copies * PLANNED_DRAWS * dimension(search.sim) ** 2)
@@ -78,7 +78,7 @@ def importance_estimate(
     if best.relative > by_populations / math.sqrt(1 + left / search.evaluations(kinds[0])):
         return None
     for_pilot, for_draws = jax.random.split(search.key)
-    pilot = best._replace(draws=max(best.draws // PILOT_DIVISOR, LANES))
+    pilot = best._replace(draws=max(best.draws // PILOT_DIVISOR, BLOCK))
     found = _draw_estimate(search, name, "a pilot of importance sampling", for_pilot, pilot, level)
     if found is None or search.interrupted:
         return None
@@ -111,7 +111,7 @@ def _fit_proposal(search, samples, log_mean, left, components):
     moment = math.exp(min(log_moment - log_mean, 700.0))  # e^700: no Gaussians serve
     products = len(q.means) * points.shape[1] ** 2
     wanted = min(moment / TARGET_ERROR**2, MAX_PRODUCTS / products, left)
-    draws = max(int(wanted), LANES)
+    draws = max(int(wanted), BLOCK)
     return FittedProposal(q, draws, math.sqrt(moment / draws))
 
 

@@ -21,10 +21,10 @@ from jax import lax
 
 from jast._src.core.simulator import Simulator
 from jast._src.normal_space.transform import dimension, normal_numbers, outcome_by_level
+from jast._src.runtime.device import block_size
 
 __all__ = [
     "AFTER",
-    "LANES",
     "SMALL",
     "WINDOW",
     "Particles",
@@ -36,8 +36,6 @@ __all__ = [
     "record_crossings",
 ]
 
-LANES = 128
-"""Points that are simulated side by side: their numbers then stay in the caches of a core."""
 TARGET_ACCEPTANCE = 0.35
 """Share of the moves that are taken, to which their sizes are steered; .2 to .5 serve alike."""
 SMALL, WINDOW, AFTER, STAY = range(4)
@@ -160,7 +158,7 @@ def move_particles(
 @partial(jax.jit, donate_argnums=1)
 def _move_on_device(sim, particles, key, rows, size, live, moves, kinds, level, width, ratio):
     n, d = particles.z.shape
-    lanes = min(LANES, n)
+    lanes = block_size(n)
     play = jax.vmap(lambda z: outcome_by_level(sim, z, level))
     number = jnp.arange(d, dtype=jnp.int32)[None]
     lane = jnp.arange(lanes, dtype=jnp.int32)

@@ -18,13 +18,14 @@ from jast._src.estimate.population.answer import (
     estimate_from_plain_draws,
     estimate_from_populations,
 )
-from jast._src.estimate.population.descents import SETTINGS, population_size
+from jast._src.estimate.population.descents import population_size
 from jast._src.estimate.population.importance import importance_estimate
 from jast._src.estimate.population.particle_moves import allocate_particles, draw_particles
 from jast._src.estimate.population.search import PopulationSearch
 from jast._src.normal_space import transform
 from jast._src.runtime import work
 from jast._src.runtime.checkpoints import open_checkpoint
+from jast._src.runtime.device import on_cpu
 from jast._src.runtime.memory import require
 from jast._src.runtime.progress_bar import Watch
 from jast._src.util.checks import check_random_key, whole_number
@@ -49,7 +50,7 @@ def population(
     sim: Simulator,
     budget: int = 2_000_000,
     *,
-    particles: int = SETTINGS.particles,
+    particles: int | None = None,
     level: float = 0.95,
     progress: bool = False,
     callback: Callback | None = None,
@@ -85,8 +86,8 @@ def population(
         key: consumed.
         sim: the simulator; its disturbances have quantile functions.
         budget: episodes to simulate, at least 20,000, nearly: a population that has begun is ended.
-        particles: points of a population at most, at least 128; fewer where the budget is small,
-            or episodes have very many numbers.
+        particles: points of a population at most, at least 128, or None for 8192 (262,144 on an
+            accelerator); fewer where the budget is small, or episodes have very many numbers.
         level: of the interval, in (0, 1).
         progress: whether to show a progress bar.
         callback: called as ``callback(done, total, None)`` after each population, and at the end.
@@ -116,7 +117,8 @@ def population(
     name = "population"
     check_random_key(name, key)
     budget = whole_number(name, "budget", budget, MIN_BUDGET)
-    particles = whole_number(name, "particles", particles, MIN_PARTICLES)
+    if particles is not None:
+        particles = whole_number(name, "particles", particles, MIN_PARTICLES)
     level = checked_level(name, level)
     transform.check(name, sim)
     placement = work.placement(name, executor, devices)
@@ -140,13 +142,12 @@ def episodes_a_second(key: jax.Array, sim: Simulator) -> float:
     """How many episodes a population simulates in a CPU second (of an accelerator: a second), by
     two timed draws after one that compiles.
     """
-    on_cpu = jax.default_backend() == "cpu"
-    clock = time.process_time if on_cpu else time.perf_counter
-    n = population_size(sim, SETTINGS.particles)
+    clock = time.process_time if on_cpu() else time.perf_counter
+    n = population_size(sim)
     particles, key = allocate_particles(sim, n), counter_key(key, 4)
     particles, _ = draw_particles(sim, particles, key, MIN_PARTICLES)
-    m = MIN_PARTICLES
-    while True:  # an expensive system is not run 8192 times for this
+    m = MIN_PARTICLES if on_cpu() else n  # an accelerator takes as long for few
+    while True:  # an expensive system is not run so often for this
         begun = clock()
         particles, _ = draw_particles(sim, particles, key, m)
         jax.block_until_ready(particles)
@@ -162,7 +163,7 @@ def by_populations(
     sim: Simulator,
     budget: int,
     *,
-    particles: int = SETTINGS.particles,
+    particles: int | None = None,
     level: float = 0.95,
     watched: tuple = (False, None),
     placement: work.Placement = work.HERE,

@@ -14,9 +14,9 @@ import numpy as np
 from jast._src.core.float_resolution import rounding_problem
 from jast._src.estimate.estimate import MAX_INVALID_SHARE
 from jast._src.estimate.population.descents import DESCENTS, SETTINGS, Descent
-from jast._src.estimate.population.particle_moves import LANES
 from jast._src.runtime import work as units
 from jast._src.runtime.backends import Task
+from jast._src.runtime.device import BLOCK
 from jast._src.util.intervals import clopper_pearson
 
 __all__ = [
@@ -197,7 +197,7 @@ class PopulationSearch:
         """Populations of this kind, alike in size, for so many ``evaluations``."""
         points, most = evaluations / self.cost(kind), min(2 * self.n, self.capacity)
         count = max(math.ceil(points / most), 1)
-        n = int(points / count) // LANES * LANES
+        n = int(points / count) // BLOCK * BLOCK
         if n >= min(MIN_POINTS, self.n) and not self.interrupted:
             self.run(kind, int(points) // n, n)  # what whole blocks of lanes leave is one more
 

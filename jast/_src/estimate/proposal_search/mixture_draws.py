@@ -19,6 +19,7 @@ __all__ = [
     "log_ratio",
     "numbers_of_chunk",
     "plain_chunk",
+    "plain_parts",
     "random_numbers",
     "resample",
     "rows_of",
@@ -74,9 +75,16 @@ def component_numbers(key, i, n, dtype):
 
 def plain_chunk(key, i, n, sim):
     """The first ``n`` points [n, D] of chunk ``i`` of the model itself."""
+    return np.concatenate([np.asarray(z) for z in plain_parts(key, i, n, sim)])[:n]
+
+
+def plain_parts(key, i, n, sim):
+    """The same in parts [`rows_of`, D] on the device, of which the last has more than are asked
+    for.
+    """
     d, dtype, m = transform.dimension(sim), transform.normal_numbers(sim), rows_of(sim)
-    parts = (_normals(counter_key(key, NORMALS, i, j), m, d, dtype) for j in range(-(-n // m)))
-    return np.concatenate([np.asarray(z) for z in parts])[:n]
+    for j in range(-(-n // m)):
+        yield _normals(counter_key(key, NORMALS, i, j), m, d, dtype)
 
 
 @partial(jax.jit, static_argnums=(1, 2, 3))

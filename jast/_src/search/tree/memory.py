@@ -4,9 +4,8 @@ import os
 import warnings
 from typing import Any
 
-import jax
-
 from jast._src.core.signature import signature_of
+from jast._src.runtime.device import on_cpu
 from jast._src.runtime.memory import available, readable, require
 from jast._src.search.tree.layout import Problem, most_lanes, pages_of
 from jast._src.search.tree.run import Plan, bytes_per_tree
@@ -45,7 +44,7 @@ def fit(
     Raises:
         ValueError: if it does not fit, with the numbers.
     """
-    host = jax.default_backend() == "cpu"
+    host = on_cpu()
     if threads is None:
         threads = max(1, min(_cores(), trees // 8)) if host else 1
     given, free = lanes, available() if free is None else free
