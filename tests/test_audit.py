@@ -167,12 +167,12 @@ def test_shares_beyond_the_whole_are_in_words():
 
 
 @pytest.mark.parametrize("seed", [0, 4, 7, 15])
-def test_an_island_that_levels_pass_by_is_found_by_wide_noise(seed):
+def test_an_island_that_levels_pass_by_is_found_by_walks(seed):
     """Of ``squares`` 6.5 % lie in a small square far behind the boundary of a large one. Without
-    wide noise these four keys were believed 6 to 8 % low, with a standard error of 1.6 %.
+    walks these four keys were believed 6 to 8 % low, with a standard error of 1.6 %.
     """
     truth = squares_probability()
     f = failure_probability(jax.random.key(seed), squares(), 10_000)
-    assert any("times wider noise not covered" in line for line in f.history)
+    assert any("times wider noise end uncovered" in line for line in f.history)
     assert not f.reliable or abs(f.mean / truth - 1) < 4 * f.relative_error
     assert f.relative_error < 0.04

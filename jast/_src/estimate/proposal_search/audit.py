@@ -16,6 +16,7 @@ from jast._src.estimate.host_populations import (
     draw_wide,
     equilibrate,
     explore,
+    walk_down,
 )
 from jast._src.estimate.proposal_search.adapt import adapt_proposal
 from jast._src.estimate.proposal_search.search_state import (
@@ -52,15 +53,18 @@ def audit_proposal(family: Family, state: SearchState) -> SearchState:
     again; what the last one finds becomes a reason against the estimate.
     """
     settings = family.settings
-    state, cooled = _equilibrate_cooled(family, _add_wide_failures(family, state))
-    end = settings.search_end * family.budget
+    state, cooled = _equilibrate_cooled(family, _add_walked_failures(family, state))
+    end, explored = settings.search_end * family.budget, False
     for left in reversed(range(settings.audits)):
         state = state._replace(reasons=())  # what is still wrong is said again
-        wide = _affords_wide_noise(family, state) and not _population_size(family, state)
+        affords = _population_size(family, state)
+        wide = _affords_wide_noise(family, state) and not affords
         if wide:
             state = _draw_widely(family, state, settings.wide_audit)
             state, cooled = _equilibrate_cooled(family, state)
-        state, missing = _missing(family, state, cooled, wide)
+        # a population that found nothing looked at less than the proposal now draws
+        state, missing = _missing(family, state, cooled, wide or (explored and not affords))
+        explored = UNFINISHED not in state.reasons and all(math.isnan(m.share) for m in missing)
         last = wide or not left or state.spent + LEAST_BATCHES * family.batch > end
         if not (missing := [m for m in missing if not (last and m.by_chance)]):
             break
@@ -142,30 +146,37 @@ def _draw_widely(family, state, n):
 
 
 def _has_few_numbers(family):
-    """Whether wide noise comes to islands of failures, and moves lead from there to where the model
-    has them.
+    """Whether walks from wide noise come to islands of failures, and moves lead from there to where
+    the model has them.
     """
     return dimension(family.sim) < family.settings.moments_numbers
 
 
-def _add_wide_failures(family, state):
-    """The state of a system of few numbers, with the uncovered failures of wide noise before those
-    that it knows: levels of the miss distance pass by an island of failures. Any other state as it
-    is.
+def _add_walked_failures(family, state):
+    """The state of a system of few numbers, with the uncovered failures that points of wide noise
+    walk to before those that it knows: a population passes by an island of failures. Any other
+    state as it is.
     """
-    if not _has_few_numbers(family):
+    s, known, rng = family.settings, state.cooled, family.context.rng
+    n = min(int(s.walk_share * family.budget / (1 + s.walk_moves)), s.walks_most)
+    if not n or not _has_few_numbers(family):
         return state
-    known = state.cooled
-    state = _draw_widely(family, state, int(family.settings.wide_share * family.budget))
-    return state if known is None else state._replace(cooled=np.concatenate([state.cooled, known]))
+    outside = family.exclusion(state.q, _coverage_threshold(family, state))
+    failures, width, evaluations = walk_down(
+        rng, family.sim, n, s.walk_moves, state.log_mean, covered=outside
+    )
+    found = f"{len(failures.z)} of {n} walks from {width:.2f} times wider noise end uncovered"
+    state = state.note(f"audit: {found}", evaluations)
+    cooled = failures.z if known is None else np.concatenate([failures.z, known])
+    return state._replace(cooled=cooled)
 
 
-def _missing(family, state, cooled, wide):
+def _missing(family, state, cooled, explored):
     """[`Missing`, ...] by populations, those of the search too, and by the ``cooled`` failures;
-    where noise was ``wide`` no population is needed.
+    where all is ``explored`` no further population is needed.
     """
     settings = family.settings
-    state, found = (state, []) if wide else _explore_uncovered(family, state)
+    state, found = (state, []) if explored else _explore_uncovered(family, state)
     missing = []
     for share, p in [*found, *((1.0, p) for p in state.populations)]:
         state, points = family.as_points(state, p.points, p.used)

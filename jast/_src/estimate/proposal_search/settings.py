@@ -174,10 +174,15 @@ class SearchSettings(NamedTuple):
     """Draws of wide noise before half-spaces are fitted, and in place of a population that the
     budget does not afford: of 40 one fails with a chance of .94 in a mode that has a tenth of a
     probability of 2e-4, .97 of 1e-8."""
-    wide_share: float = 0.04
-    """Share of the budget that is draws of wide noise where a system has fewer than
-    `moments_numbers`. With .02 an island of 6.5 % of the probability was missed unseen by 2 of 20
-    keys (``squares`` of `benchmarks.literature`, 10,000 evaluations), without by 9."""
+    walk_share: float = 0.08
+    """Share of the budget that is walks from wide noise to failures where a system has fewer than
+    `moments_numbers`. Of 30 keys of ``islands`` (`benchmarks.probability`, 10,000 evaluations) 2 of
+    22 believed answers are then more than 4 standard errors off; with .04 and 25 moves 4 of 23,
+    with .04 and no moves 7 of 21."""
+    walks_most: int = 100
+    """Such walks at most: of 30 keys with 40,000 evaluations, which are 78, none is missed."""
+    walk_moves: int = 40
+    """Moves of such a walk."""
     audit_overrun: float = 1.5
     """Factor on that, as levels fall more slowly where miss distances take few values."""
     audit_population_least: int = 40
