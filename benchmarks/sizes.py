@@ -28,7 +28,6 @@ __all__ = [
     "printer",
     "processors",
     "print_report",
-    "seconds",
     "size",
     "add_choices",
     "timed",
@@ -75,13 +74,6 @@ def print_report(args: argparse.Namespace, report: Any, text: str = "") -> None:
     """Print the report: as JSON, or its text."""
     if args.json or text:
         print(json.dumps(report) if args.json else text)
-
-
-def seconds() -> float:
-    """A clock: CPU seconds of this process, and where programs run on an accelerator, those on the
-    wall.
-    """
-    return time.process_time() if jax.default_backend() == "cpu" else time.perf_counter()
 
 
 def timed(function: Callable[[], T]) -> tuple[T, float, float]:

@@ -22,9 +22,10 @@ from jax.tree_util import Partial
 
 import jast
 from benchmarks.closed_loops import JUDGED, RARE, TUNED, system
-from benchmarks.sizes import add_choices, options, percent, print_report, printer, seconds, size
+from benchmarks.sizes import add_choices, options, percent, print_report, printer, size
 from jast._src.normal_space.evaluate_points import evaluate_points
 from jast._src.normal_space.transform import dimension
+from jast._src.runtime.device import on_cpu, read_clock
 from jast.simulators import limit_state
 
 __all__ = [
@@ -147,7 +148,7 @@ METHODS = ("failure_probability", "stress", "subset")
 
 def answers(method: str, about: System, seed: int) -> tuple[Any, float]:
     """The `Estimate` of a method (of OpenTURNS (log mean, relative error)), and CPU seconds."""
-    begun, key = seconds(), jax.random.key(seed)
+    begun, key = read_clock(), jax.random.key(seed)
     with warnings.catch_warnings(action="ignore"):
         if method == "stress":
             found = jast.stress(key, about.simulator, about.budget).probability
@@ -155,7 +156,7 @@ def answers(method: str, about: System, seed: int) -> tuple[Any, float]:
             found = jast.estimate.failure_probability(key, about.simulator, about.budget)
         else:
             found = _subset(about, seed)
-    return found, seconds() - begun
+    return found, read_clock() - begun
 
 
 def _subset(about, seed):
@@ -190,11 +191,11 @@ def _subset(about, seed):
 
 def row_of(name: str, about: System, method: str, seeds: int) -> dict[str, Any]:
     """Figures of a method on a system over ``seeds`` keys."""
-    found, clocked = [], []
+    found, seconds = [], []
     for seed in range(seeds):
         one, spent = answers(method, about, seed)
         found.append(one)
-        clocked.append(spent)
+        seconds.append(spent)
     if method == "subset":
         logs, errors = np.array(found).T
         reliable, evaluations = np.isfinite(logs), 0
@@ -215,7 +216,7 @@ def row_of(name: str, about: System, method: str, seeds: int) -> dict[str, Any]:
     def rms(a):
         return float(np.sqrt(np.mean(a**2))) if a.size else None
 
-    warm = float(np.mean(clocked[1:])) if seeds > 1 else None
+    warm = float(np.mean(seconds[1:])) if seeds > 1 else None
     return dict(
         system=name,
         group=about.group,
@@ -228,23 +229,23 @@ def row_of(name: str, about: System, method: str, seeds: int) -> dict[str, Any]:
         held=int(holds[known].sum()),
         silent_misses=int((known & (z > 4)).sum()),
         evaluations=evaluations,
-        first=clocked[0],
+        first=seconds[0],
         warm=warm,
     )
 
 
-def plain_draws(about: System, spent: float) -> float | None:
+def plain_draws(about: System, seconds: float) -> float | None:
     """The relative standard error of plain draws in so many CPU seconds."""
-    n = 2**15 if jax.default_backend() == "cpu" else 2**22
+    n = 2**15 if on_cpu() else 2**22
 
     def count(seed):
         return jast.estimate.monte_carlo(jax.random.key(seed), about.simulator, n)
 
     count(0)
-    begun = seconds()
+    begun = read_clock()
     count(1)
-    rate = n / (seconds() - begun)
-    return math.sqrt((1 - about.truth) / about.truth / (rate * spent)) if about.truth else None
+    rate = n / (read_clock() - begun)
+    return math.sqrt((1 - about.truth) / about.truth / (rate * seconds)) if about.truth else None
 
 
 def main(argv: list[str] | None = None) -> None:

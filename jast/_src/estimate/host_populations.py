@@ -31,7 +31,6 @@ __all__ = [
     "equilibrate",
     "explore",
     "next_level",
-    "walk_down",
 ]
 
 LEVEL_SHARE = 0.25
@@ -249,35 +248,24 @@ def draw_wide_failures(key, sim, n, *, covered=None):
     return population.take(failing), width, sampler
 
 
-def draw_wide(rng, sim, n, log_mean, *, covered=None):
+def draw_wide(rng, sim, n, log_mean, *, moves=0, covered=None):
     """The failures among ``n`` draws of noise so wide that a half-space with the probability of
     ``log_mean`` has `FAILING_SHARE` of them: (`Population` [m], the width). ``covered`` as in
     `explore`. Of a tenth of that probability it has nearly as many: .067 of the draws for 2e-4,
     .086 for 1e-8.
-    """
-    width = _failing_width(log_mean)
-    population = PopulationSampler(rng, sim, n, covered).draw(width)
-    return population.take(population.score == -np.inf), width
 
-
-def walk_down(rng, sim, n, moves, log_mean, *, covered=None):
-    """The failures that ``n`` points of wide noise come to by so many Markov moves, each of which
-    is taken where the miss distance does not grow: (`Population` [m], the width, evaluations). As
-    none replaces another one, a region of failures is found that most points are far from.
-    ``log_mean`` as in `draw_wide`, ``covered`` as in `explore`.
+    With ``moves``, the failures that they walk to: each makes so many Markov moves, which are taken
+    where the miss distance does not grow. As none replaces another one, a region of failures is
+    found that most points are far from.
     """
-    width = _failing_width(log_mean)
+    from scipy.special import ndtri, ndtri_exp  # here: slow to import
+
+    width = max(float(ndtri_exp(min(log_mean, 0.0)) / ndtri(FAILING_SHARE)), 1.0)
     sampler = PopulationSampler(rng, sim, n, covered)
     population = sampler.draw(width)
     for _ in range(moves):
         population = sampler.move(population, population.score, width, 1)
-    return population.take(population.score == -np.inf), width, sampler.evaluations
-
-
-def _failing_width(log_mean):
-    from scipy.special import ndtri, ndtri_exp  # here: slow to import
-
-    return max(float(ndtri_exp(min(log_mean, 0.0)) / ndtri(FAILING_SHARE)), 1.0)
+    return population.take(population.score == -np.inf), width
 
 
 def bracket_boundary(key, sim, n):

@@ -1,10 +1,11 @@
 """What the device that programs run on asks of their shapes."""
 
 import contextlib
+import time
 
 import jax
 
-__all__ = ["BLOCK", "block_size", "on_cpu", "where_few_points_run"]
+__all__ = ["BLOCK", "block_size", "on_cpu", "read_clock", "where_few_points_run"]
 
 BLOCK = 128
 """Episodes that a core of a CPU runs side by side: their numbers then stay in its caches."""
@@ -23,6 +24,13 @@ def block_size(n: int) -> int:
     accelerator, which has a thread for each.
     """
     return min(BLOCK, n) if on_cpu() else n
+
+
+def read_clock() -> float:
+    """The seconds that work is measured in: of this process on a CPU, where others may run beside
+    it; on an accelerator those of the clock on the wall.
+    """
+    return time.process_time() if on_cpu() else time.perf_counter()
 
 
 def where_few_points_run() -> contextlib.AbstractContextManager:

@@ -4,7 +4,6 @@ ways that know nothing of each other agree.
 
 from __future__ import annotations
 
-import time
 from collections.abc import Sequence
 
 import jax
@@ -25,7 +24,7 @@ from jast._src.estimate.population.search import PopulationSearch
 from jast._src.normal_space import transform
 from jast._src.runtime import work
 from jast._src.runtime.checkpoints import open_checkpoint
-from jast._src.runtime.device import on_cpu
+from jast._src.runtime.device import on_cpu, read_clock
 from jast._src.runtime.memory import require
 from jast._src.runtime.progress_bar import Watch
 from jast._src.util.checks import check_random_key, whole_number
@@ -142,16 +141,15 @@ def episodes_a_second(key: jax.Array, sim: Simulator) -> float:
     """How many episodes a population simulates in a CPU second (of an accelerator: a second), by
     two timed draws after one that compiles.
     """
-    clock = time.process_time if on_cpu() else time.perf_counter
     n = population_size(sim)
     particles, key = allocate_particles(sim, n), counter_key(key, 4)
     particles, _ = draw_particles(sim, particles, key, MIN_PARTICLES)
     m = MIN_PARTICLES if on_cpu() else n  # an accelerator takes as long for few
     while True:  # an expensive system is not run so often for this
-        begun = clock()
+        begun = read_clock()
         particles, _ = draw_particles(sim, particles, key, m)
         jax.block_until_ready(particles)
-        spent = clock() - begun
+        spent = read_clock() - begun
         if spent > TIMED_SECONDS or m == n:
             return m / max(spent, 1e-9)
         m = min(8 * m, n)

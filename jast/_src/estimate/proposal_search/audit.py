@@ -16,7 +16,6 @@ from jast._src.estimate.host_populations import (
     draw_wide,
     equilibrate,
     explore,
-    walk_down,
 )
 from jast._src.estimate.proposal_search.adapt import adapt_proposal
 from jast._src.estimate.proposal_search.search_state import (
@@ -57,13 +56,13 @@ def audit_proposal(family: Family, state: SearchState) -> SearchState:
     end, explored = settings.search_end * family.budget, False
     for left in reversed(range(settings.audits)):
         state = state._replace(reasons=())  # what is still wrong is said again
-        affords = _population_size(family, state)
-        wide = _affords_wide_noise(family, state) and not affords
+        size = _population_size(family, state)
+        wide = _affords_wide_noise(family, state) and not size
         if wide:
             state = _draw_widely(family, state, settings.wide_audit)
             state, cooled = _equilibrate_cooled(family, state)
         # a population that found nothing looked at less than the proposal now draws
-        state, missing = _missing(family, state, cooled, wide or (explored and not affords))
+        state, missing = _missing(family, state, cooled, wide or (explored and not size))
         explored = UNFINISHED not in state.reasons and all(math.isnan(m.share) for m in missing)
         last = wide or not left or state.spent + LEAST_BATCHES * family.batch > end
         if not (missing := [m for m in missing if not (last and m.by_chance)]):
@@ -136,13 +135,18 @@ def _affords_wide_noise(family, state):
     return bool(s.wide_audit) and _room(family, state) > s.wide_audit + s.burn_in_moves
 
 
-def _draw_widely(family, state, n):
-    """The state with the uncovered failures among ``n`` draws of wide noise."""
+def _draw_widely(family, state, n, moves=0):
+    """The state with the uncovered failures that ``n`` draws of wide noise are, or walk to by so
+    many ``moves`` each.
+    """
     outside = family.exclusion(state.q, _coverage_threshold(family, state))
-    log_mean, rng = state.log_mean, family.context.rng
-    failures, width = draw_wide(rng, family.sim, n, log_mean, covered=outside)
-    text = f"audit: {len(failures.z)} of {n} draws of {width:.2f} times wider noise not covered"
-    return state.note(text, n)._replace(cooled=failures.z)
+    failures, width = draw_wide(
+        family.context.rng, family.sim, n, state.log_mean, moves=moves, covered=outside
+    )
+    wide = f"{width:.2f} times wider noise"
+    said = f"walks from {wide} end uncovered" if moves else f"draws of {wide} not covered"
+    state = state.note(f"audit: {len(failures.z)} of {n} {said}", n * (1 + moves))
+    return state._replace(cooled=failures.z)
 
 
 def _has_few_numbers(family):
@@ -157,18 +161,12 @@ def _add_walked_failures(family, state):
     walk to before those that it knows: a population passes by an island of failures. Any other
     state as it is.
     """
-    s, known, rng = family.settings, state.cooled, family.context.rng
+    s, known = family.settings, state.cooled
     n = min(int(s.walk_share * family.budget / (1 + s.walk_moves)), s.walks_most)
     if not n or not _has_few_numbers(family):
         return state
-    outside = family.exclusion(state.q, _coverage_threshold(family, state))
-    failures, width, evaluations = walk_down(
-        rng, family.sim, n, s.walk_moves, state.log_mean, covered=outside
-    )
-    found = f"{len(failures.z)} of {n} walks from {width:.2f} times wider noise end uncovered"
-    state = state.note(f"audit: {found}", evaluations)
-    cooled = failures.z if known is None else np.concatenate([failures.z, known])
-    return state._replace(cooled=cooled)
+    state = _draw_widely(family, state, n, s.walk_moves)
+    return state if known is None else state._replace(cooled=np.concatenate([state.cooled, known]))
 
 
 def _missing(family, state, cooled, explored):
