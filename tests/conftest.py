@@ -47,11 +47,10 @@ def pytest_configure(config):
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(config, items):
-    """What depends on the compiler runs twice: with the long tests, optimised."""
-    if config.option.markexpr == "long":
-        for item in items:
-            if "equal" in item.fixturenames or item.get_closest_marker("compiled"):
-                item.add_marker("long")
+    """What depends on the compiler is long: it runs as users have it, optimised."""
+    for item in items:
+        if "equal" in item.fixturenames or item.get_closest_marker("compiled"):
+            item.add_marker("long")
 
 
 @pytest.fixture

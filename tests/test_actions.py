@@ -39,6 +39,7 @@ def models(dtype):
     )
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("model", list(models("float32")))
 @pytest.mark.parametrize("kind", list(kinds("float32")))
 def test_locate_inverts_at(kind, model, dtype, key):
@@ -148,6 +149,7 @@ def test_a_box_with_ends_for_each_part_is_the_boxes_of_its_parts(key):
     assert (draws["b"].max(0) > 3.9).all()
 
 
+@pytest.mark.long
 def test_check_says_what_is_wrong_with_the_ends_of_a_box():
     joint = lambda s: D.Joint({"a": D.Normal(0.0, 1.0), "b": D.Normal(0.0, 1.0)})
     sim = jast.Simulator(

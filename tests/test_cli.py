@@ -25,6 +25,7 @@ def cached(monkeypatch):
     return calls
 
 
+@pytest.mark.long
 def test_compiled_programs_are_kept_unless_told_otherwise(capsys, tmp_path, cached):
     run(capsys, tmp_path, "--method", "monte-carlo", "--no-cache")
     assert cached == []
@@ -47,6 +48,7 @@ def run(capsys, tmp_path, *argv):
     return status, capsys.readouterr().out, tmp_path / "out"
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("method", ["forest", "mcts", "cem", "monte-carlo"])
 def test_every_method_reports_and_saves(capsys, tmp_path, method):
     status, text, out = run(
@@ -81,6 +83,7 @@ def walk():
 """
 
 
+@pytest.mark.long
 def test_stress_of_a_system_of_ones_own(capsys, tmp_path):
     (tmp_path / "own.py").write_text(OWN)
     command = [f"{tmp_path / 'own.py'}:walk", "--budget", "600", "--quiet"]
@@ -219,6 +222,7 @@ def test_interrupted_at_once(capsys, tmp_path, monkeypatch):
     assert "interrupted before there was a result" in capsys.readouterr().err
 
 
+@pytest.mark.long
 def test_interrupted_search_reports_what_was_done(capsys, tmp_path, monkeypatch):
     whole = cli.forest
 

@@ -362,6 +362,7 @@ CHECKED = mark_long(
 )
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("scenario, kinds", CHECKED, ids=str)
 def test_contract(scenario, kinds):
     sim = colav(scenario, kinds)
@@ -382,6 +383,7 @@ def test_disturbances_are_a_dict_where_there_are_several():
     assert {k: a.shape for k, a in start(*KINDS).items()} == shapes
 
 
+@pytest.mark.long
 def test_dtypes(flown):
     def floats(tree):
         return {
@@ -513,6 +515,7 @@ def test_a_longer_horizon_goes_on_as_a_shorter_one(flown):
 # undisturbed
 
 
+@pytest.mark.long
 def test_the_undisturbed_ferry_keeps_ten_metres(key):
     """Measured: head-on 16.09, crossing 25.41, sharp turn 15.65 m; overtaking, in the test above,
     14.10 m.
@@ -528,6 +531,7 @@ def test_the_undisturbed_ferry_keeps_ten_metres(key):
         assert float(found.distance) == pytest.approx(expected, abs=0.02)
 
 
+@pytest.mark.long
 def test_collision_avoidance_is_worth_metres_in_every_scenario(flown):
     """With the order kept at the desired speed the second model comes to 0.9, 8.2, 12.9 and 9.0 m:
     head-on is a collision, the others are near misses.
@@ -753,6 +757,7 @@ def test_mirrored_starts_have_mirrored_paths():
     assert np.abs(left[0][:, 5, 1]).max() > 0.5
 
 
+@pytest.mark.long
 def test_ferry_is_first_order_in_the_substep(flown):
     """Against Runge-Kutta, with the orders of the published scenarios and from starts aside of the
     path. Measured over 75 s at 30 substeps: 9 cm, 2 cm/s.
@@ -784,6 +789,7 @@ def test_ferry_is_first_order_in_the_substep(flown):
     assert errors[1].max() < 0.1 and slips[1].max() < 0.05
 
 
+@pytest.mark.long
 def test_flown_ferries_are_those_of_the_second_model(flown, sailed):
     """The default 30 substeps, with the planner's orders as they came. Measured: 9 cm."""
     worst = 0
@@ -1583,6 +1589,7 @@ def test_a_traced_delay_beyond_the_buffer_is_that_of_the_buffer():
         np.testing.assert_array_equal(far, most)
 
 
+@pytest.mark.long
 def test_scales_may_be_arrays_and_are_refused_by_name():
     assert jast.check(colav(disturbances="noise", noise=np.array([0.3, 0.1]))).horizon == STEPS
     with pytest.raises(ValueError, match="colav: delay_change must be a positive number"):

@@ -47,6 +47,7 @@ def bits(word):
     return ((word[..., None] >> np.arange(32, dtype=np.uint32)) & 1).astype(np.int8)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("seed", SEEDS)
 def test_bits_and_bytes_are_uniform(seed):
     for word in streams(seed):

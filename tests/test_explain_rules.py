@@ -58,6 +58,7 @@ def found():
     return explain.rules(SIM, drawn(0, 12, SIM, gust=2.0, delay=1.0), episodes=400)
 
 
+@pytest.mark.long
 def test_the_planted_rule_in_the_words_of_the_user(found):
     (rule,) = found.rules
     bounds = {what: (low, high) for what, _, low, high in rule.conditions}
@@ -167,6 +168,7 @@ def test_groups_are_held_out_as_a_whole():
     assert 0 < hold_out(rng, owner, group, 0.3).mean() < 0.35
 
 
+@pytest.mark.long
 def test_an_early_end_tells_nothing():
     """The system fails at the first great gust and ends there; others go on. Neither the length nor
     what is behind the end may serve as a rule.
@@ -187,6 +189,7 @@ def test_an_early_end_tells_nothing():
         assert r.precision["fails"] > 0.95 and r.recall["fails"] > 0.95
 
 
+@pytest.mark.long
 def test_rules_of_choices():
     """Three slips in a row."""
     sim = slips()
@@ -198,6 +201,7 @@ def test_rules_of_choices():
     assert r.recall["fails"] > 0.8
 
 
+@pytest.mark.long
 def test_a_start_and_states_have_their_names():
     sim = late_gust(
         start=lambda: Joint(dict(load=Uniform(0.0, 1.0))),
@@ -213,6 +217,7 @@ def test_a_start_and_states_have_their_names():
     assert r.predict(bad).shape == bad.length.shape
 
 
+@pytest.mark.long
 def test_one_failure_and_float64(x64):
     """Variants of a single failure are enough."""
     sim = late_gust()
@@ -239,6 +244,7 @@ def test_a_black_box_is_called_as_often_as_is_said():
     assert "x at step 2 > " in str(r) and len(calls) <= r.evaluations + 10
 
 
+@pytest.mark.long
 def test_bad_rules():
     bad, calm = drawn(0, 6, SIM, gust=2.0, delay=1.0), drawn(1, 20, SIM)
     with pytest.raises(ValueError, match="rules: failures must all fail"):
@@ -287,6 +293,7 @@ def walked():
     return sim, bad, jax.tree.map(lambda a: a[:400], calm)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("model", ["boosted", "logistic"])
 def test_a_monitor_warns_before_a_walk_fails(walked, model):
     sim, bad, calm = walked

@@ -418,6 +418,7 @@ def test_damaged_files_are_refused_or_harmless(tmp_path, archive, seed):
             F.load(path)
 
 
+@pytest.mark.long
 def test_failures_as_plain_numbers(tmp_path):
     """A stranger's program gets the same failure from the table: ten lines of plain Python."""
     sim = jast.Simulator(

@@ -113,6 +113,7 @@ def test_every_episode_is_counted_once():
     assert result.roots.valid.all() and (result.roots.visits[0].sum(1) == 60).all()
 
 
+@pytest.mark.long
 def test_the_archive_holds_the_best():
     three, many = once("landing", top=3), once("landing")
     assert three.failures.size == 3 and three.failures.seen == many.failures.seen > 64
@@ -219,6 +220,7 @@ def test_all_actions_search_all_systems(name, actions):
         assert result.failures.size > 0
 
 
+@pytest.mark.long
 def test_prunes_beyond_the_horizon_are_left_out():
     result = searched("limit_state")
     assert result.settings["prunes"] == 1 and result.episodes == 6 * 60
@@ -228,6 +230,7 @@ def _breaking(s, x):
     return s + jnp.where(s > 1.0, jnp.nan, x)
 
 
+@pytest.mark.long
 def test_a_simulator_that_returns_nan_is_counted_and_never_best():
     sim = walk(step=_breaking)
     result = forest(jax.random.key(0), sim, **SIZE, reward=BONUS, actions=ACTIONS["samples"])
@@ -237,6 +240,7 @@ def test_a_simulator_that_returns_nan_is_counted_and_never_best():
     honest(result, sim, BONUS)
 
 
+@pytest.mark.long
 def test_a_simulator_that_returns_only_nan():
     sim = walk(step=lambda s, x: s * jnp.nan)
     result = forest(jax.random.key(0), sim, **SIZE, reward=BONUS, actions=ACTIONS["samples"])
@@ -286,6 +290,7 @@ def test_a_system_that_always_fails_at_its_first_step():
     honest(result, sim, BONUS)
 
 
+@pytest.mark.long
 def test_trees_that_end_early_end_apart():
     """A tree whose root is an episode's end stops; the others go on, also those of other groups."""
     sim = walk(fails=lambda s: s > 2.0)
@@ -308,6 +313,7 @@ def test_trees_that_end_early_end_apart():
 # ----------------------------------------------------------------------------
 
 
+@pytest.mark.long
 def test_an_interrupted_search_says_so():
     def stop(done, total, _):
         assert 0 < done <= total == 12 * 18 * 400
@@ -350,6 +356,7 @@ def test_an_error_of_the_callback_ends_the_search_at_once():
     assert time.perf_counter() - began < 60  # all of it would take minutes
 
 
+@pytest.mark.long
 def test_the_callback_is_told_of_every_simulation():
     told = []
     searched("ferry", callback=lambda done, total, _: told.append((done, total)))
@@ -424,6 +431,7 @@ def best_of(key, adversary, exploration):
     ).best_reward_per_tree
 
 
+@pytest.mark.long
 def test_a_traced_search_is_the_same_search():
     traced = best_of(jax.random.key(3), jnp.array([16.0, 0.0]), 10.0)
     np.testing.assert_allclose(traced, once("ferry").best_reward_per_tree, rtol=1e-4)

@@ -230,11 +230,13 @@ def test_builds_the_tree_of_an_independent_search_with_a_value_head(
     agree(key, EXACT, *widening, candidates, weights, share=0.0, focus=DRAWN[candidates])
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("candidates", mark_long(CANDIDATES, "all"))
 def test_builds_the_tree_of_an_independent_search_with_both_heads(candidates, key, x64):
     agree(key, EXACT, 2.0, 0.5, candidates, (0.6, 0.4), focus=DRAWN[candidates], within=1e-3)
 
 
+@pytest.mark.long
 def test_rolls_out_as_an_independent_search_at_the_first_levels_of_the_share_of_the_policy_head(
     key, x64
 ):
@@ -286,6 +288,7 @@ def built(name, candidates, memoize="node", lanes=3):
     )
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("name", "candidates"), FERRY_ONE)
 def test_counts_of_every_node_add_up(name, candidates):
     tree, root_visits, _ = built(name, candidates)
@@ -411,6 +414,7 @@ def pages_used(candidates, widening, exploration, gain):
     return np.asarray(tree.pages), T.pages_of(p, ROOM), T._pages(ROOM)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("candidates", CANDIDATES)
 @pytest.mark.parametrize("widening", [(0.5, 0.6), (2.0, 0.5), (1.0, 1.0), (8.0, 0.3), (20.0, 0.0)])
 def test_pages_never_run_out(widening, candidates):
@@ -606,6 +610,7 @@ def best_of(adversary, heads, candidates):
 NEAR = jnp.array([16.0, 0.0])
 
 
+@pytest.mark.long
 def test_a_traced_search_is_the_same_search():
     np.testing.assert_allclose(
         best_of(NEAR, KNOWN["ferry"], "one"), once("ferry").best_reward_per_tree, rtol=1e-4

@@ -29,6 +29,7 @@ def route(courses=(240.0, 200.0)):
 # fms
 
 
+@pytest.mark.long
 def test_the_failing_arc_is_shown(x64):
     sim = fms()
     episode = jast.replay(sim, route())
@@ -58,6 +59,7 @@ def test_the_failing_arc_is_shown(x64):
     assert "1, 2" in [text.get_text() for text in ground.texts]
 
 
+@pytest.mark.long
 def test_other_routes_are_drawn(x64):
     sim = fms()
     sound = plot.fms(

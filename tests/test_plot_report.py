@@ -19,6 +19,7 @@ def said(figure):
     return [text.get_text() for text in figure.texts]
 
 
+@pytest.mark.long
 def test_a_report_on_one_page(tmp_path):
     figure = plot.report(made(probability=estimate()), nominal=20, units={"speed": "m/s"})
     words = said(figure)

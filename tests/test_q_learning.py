@@ -31,6 +31,7 @@ def learned():
     return q_learning(KEY, TWO_STEPS, **SMALL)
 
 
+@pytest.mark.long
 def test_it_shares_the_way_evenly_on_both_sides(learned):
     # half a column of the table, .25, and half a cell, at most .2, beside the best
     for side in (-1.0, 1.0):
@@ -85,6 +86,7 @@ def test_it_goes_on_from_a_checkpoint_to_the_same_bits(learned, tmp_path):
     jax.tree.map(np.testing.assert_array_equal, whole.learned, learned.learned)
 
 
+@pytest.mark.long
 def test_cells_of_the_users_own_and_numbers_that_are_not_finite():
     sim = jast.Simulator(
         lambda x0: jnp.zeros(()),

@@ -85,6 +85,7 @@ def made(name):
     return (MAKERS | OTHERS)[name]()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", mark_long([*MAKERS, *OTHERS], "forest", "sac"))
 def test_a_repr_is_short_and_the_table_of_a_notebook_names_every_field(name):
     value = made(name)
@@ -140,6 +141,7 @@ def test_a_former_name_warns(name, old, new):
         assert getattr(value, old) is getattr(value, new)
 
 
+@pytest.mark.long
 def test_a_batched_and_a_traced_result_print_and_say_so():
     seen = []
 
@@ -299,6 +301,7 @@ def own_simulator():
     )
 
 
+@pytest.mark.long
 def test_states_of_an_own_class_need_the_simulator(tmp_path):
     own, path = own_simulator(), tmp_path / "s"
     found = jast.search.monte_carlo(KEY, own, episodes=300, top=3)
@@ -310,6 +313,7 @@ def test_states_of_an_own_class_need_the_simulator(tmp_path):
         jast.load(path, WALK)
 
 
+@pytest.mark.long
 def test_a_batch_nested_none_and_texts_are_kept(tmp_path):
     keys = jax.random.split(KEY, 2)
     batch = jax.vmap(lambda key: jast.search.monte_carlo(key, WALK, episodes=100))(keys)

@@ -150,6 +150,7 @@ def whole_run(tmp_path_factory):
     return whole_training(train, tmp_path_factory.mktemp("sac") / "whole.jast")
 
 
+@pytest.mark.long
 def test_the_callback_gets_the_rows_of_the_history(whole_run):
     check_rows(*whole_run[:2])
 

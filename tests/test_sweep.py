@@ -166,6 +166,7 @@ def test_a_row_that_was_interrupted_is_the_last(key):
     assert len(table.results) == 1
 
 
+@pytest.mark.long
 def test_results_of_any_kind_have_a_row(key):
     table = jast.sweep(
         key,

@@ -90,6 +90,7 @@ def test_builds_the_tree_of_an_independent_search(key, k, alpha):
     agree(key, k, alpha)
 
 
+@pytest.mark.long
 def test_builds_the_tree_of_an_independent_search_with_spread_and_focused_actions(key):
     agree(key, 2.0, 0.5, focus=0.25)
 
@@ -108,6 +109,7 @@ def test_builds_the_tree_of_an_independent_search_that_uses_its_best_episode(key
     agree(key, 2.0, 0.5, x=28.0, **dict.fromkeys(switches, True))  # nearer to a collision
 
 
+@pytest.mark.long
 def test_builds_the_tree_of_an_independent_search_in_float64(key, x64):
     agree(key, 2.0, 0.5)
 
@@ -277,6 +279,7 @@ def same_bytes(a, b):
         assert (x.dtype, x.shape, x.tobytes()) == (y.dtype, y.shape, y.tobytes())
 
 
+@pytest.mark.long
 @given(tree=st.lists(arrays(DTYPES), max_size=4))
 @settings(max_examples=25, deadline=None)
 def test_records_give_back_every_bit(tree):
@@ -437,6 +440,7 @@ def test_trees_that_do_not_fit_are_refused_with_the_numbers():
     assert not ran
 
 
+@pytest.mark.long
 def test_states_that_do_not_fit_at_nodes_are_kept_at_roots():
     sim, size = large(2000), dict(trees=2, prunes=3, simulations=120, threads=1)
     node, root = (

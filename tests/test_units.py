@@ -577,6 +577,7 @@ def test_killed_calls_go_on_to_the_same_result(name, tmp_path, same, monkeypatch
     assert lasting > 0
 
 
+@pytest.mark.long
 def test_the_settings_of_the_caller_stay_as_they_are(key):
     """Also when what the threads held is freed."""
     with jax.enable_x64(True):
