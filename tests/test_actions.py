@@ -194,6 +194,7 @@ def test_a_box_may_have_no_width_or_traced_ends():
     assert width(1.0) == -1.0
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("search", mark_long(["monte_carlo", "cem", "mcts"], "cem", "mcts"))
 def test_searches_draw_from_the_proposal_and_score_by_the_model(key, search):
     """Of landing: drifts from N(.2, .01^2), so that all fail; offsets at the start from the

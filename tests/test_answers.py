@@ -102,6 +102,7 @@ def test_the_curve_is_that_of_the_plane(found):
     assert exceedance(found, u, level=0.5).high[2] < c.high[2]
 
 
+@pytest.mark.long
 def test_nothing_is_said_of_what_few_draws_tell(found):
     c = exceedance(found, [-60.0, -3.0])
     assert np.isnan(c.probability).all() and not c.reliable.any()

@@ -92,6 +92,7 @@ def test_switches_are_located(seed, x64):
     assert away.max() < 3e-3
 
 
+@pytest.mark.long
 def test_precisions_agree():
     times = 5.0 * np.arange(20)
     single, _ = simulate("chasing cars", times, CORNERS)

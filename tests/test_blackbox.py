@@ -116,6 +116,7 @@ def test_an_object_is_judged_at_every_state_unless_said_otherwise(key):
     assert not box(lambda: blackboxes.Leaves()).episodic
 
 
+@pytest.mark.long
 def test_check_says_where_failures_on_the_way_are_lost():
     sim = box(blackboxes.Leaves, 8, episodic=True)
     with pytest.warns(
@@ -570,6 +571,7 @@ def test_objects_serve_many_episodes(monkeypatch):
     np.testing.assert_allclose(reply.distance, np.maximum(4 - rows[:, :2].sum(1), 0))
 
 
+@pytest.mark.long
 def test_an_example_ends_where_it_went_wrong(key):
     sim = box(blackboxes.Fragile, 6)
     jast.search.monte_carlo(key, sim, episodes=64, top=2)

@@ -191,6 +191,7 @@ class Broken(blackboxes.Walk):
         os._exit(1)
 
 
+@pytest.mark.long
 def test_bad_input_is_named(monkeypatch):
     lock = threading.Lock()
     with pytest.raises(ValueError, match="system cannot be sent to a worker process: .*lock"):

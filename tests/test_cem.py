@@ -124,6 +124,7 @@ def test_trees_are_independent_of_their_number(key, equal):
     }
 
 
+@pytest.mark.long
 def test_counts_of_repetitions(key):
     """One failure only: every time it was found is counted."""
     sim = jast.Simulator(

@@ -33,6 +33,7 @@ def test_compiled_programs_are_kept_unless_told_otherwise(capsys, tmp_path, cach
     assert cached == ["cache"]
 
 
+@pytest.mark.long
 def test_a_call_goes_on_where_no_program_can_be_kept(capsys, tmp_path, monkeypatch):
     def full():
         raise ValueError("cache: folder must be one that can be made")

@@ -1331,6 +1331,7 @@ def test_delays_outside_of_the_unit_interval_are_clipped(flown):
     np.testing.assert_array_equal(beyond.states.delay[1:], np.tile([1.0, 0.0], STEPS)[:STEPS])
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("kind", ["delay", "steering"])
 def test_after_an_impossible_disturbance_the_next_has_a_density(kind):
     sim = colav(disturbances=kind)
@@ -1356,6 +1357,7 @@ def distances(name, flown, sailed, records):
     return np.hypot(*gap.T)[1 : SUBSTEPS * length + 1].reshape(length, SUBSTEPS)
 
 
+@pytest.mark.long
 def test_miss_distance_is_the_least_at_substeps(flown, sailed, records):
     """Measured: 5 cm, the two vessels' errors at 30 substeps."""
     worst = 0

@@ -175,6 +175,7 @@ def test_true_model_and_sub_elites_make_the_next_proposal(k, key, x64):
     assert plan.chosen == (40,) * 4 and plan.evaluated == 0
 
 
+@pytest.mark.long
 def test_points_of_the_searches_are_evaluated_next(key):
     searches, batches = asked(
         "ce_surrogate",
@@ -233,6 +234,7 @@ def test_one_program_is_ask_and_tell(method, schedule, key, x64):
         np.testing.assert_array_equal(a, b)
 
 
+@pytest.mark.long
 def test_the_objective_is_asked_for_exactly_the_budget(key):
     calls = []
     schedule = ce.schedules.geometric(0.3)

@@ -67,6 +67,7 @@ def test_quantile_is_scipys(name, dtype):
         )
 
 
+@pytest.mark.long
 def test_quantiles_of_a_joint(dtype):
     d = D.Joint(
         (

@@ -197,6 +197,7 @@ def test_of_an_archive_and_of_choices(key):
     assert not few.reliable and str(few).startswith("UNRELIABLE")
 
 
+@pytest.mark.long
 def test_bad_input(key):
     sim = plane((1.0, 0.0), 1.0)
     safe = jax.vmap(lambda x: jast.replay(sim, x))(jnp.zeros((30, 1, 2)))

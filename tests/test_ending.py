@@ -79,6 +79,7 @@ def test_it_pays_and_leaves_the_search_as_it_was(key, name, equal, tmp_path):
     assert str(again) == str(on) and again.evaluations == on.evaluations
 
 
+@pytest.mark.long
 def test_a_reward_of_ones_own_and_what_is_published_have_none(key):
     few = dict(samples=200, elites=40, iterations=6)
     own = dict(reward=rewards.standard(event_bonus=30.0, density="mode"))
@@ -169,6 +170,7 @@ def test_a_system_on_the_host(key):
         assert bool(jast.replay(sim, e).failure) and e.disturbances[0] <= 1.9
 
 
+@pytest.mark.long
 def test_an_interruption_leaves_what_was_found(key, monkeypatch):
     def interrupted(*_, **__):
         raise KeyboardInterrupt

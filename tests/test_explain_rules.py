@@ -74,6 +74,7 @@ def test_the_planted_rule_in_the_words_of_the_user(found):
     assert found.evaluations > 10 * 400 and found.settings["method"] == "rules"
 
 
+@pytest.mark.long
 def test_a_rule_is_right_about_fresh_episodes(found):
     bad, calm = drawn(1, 400, SIM, gust=2.0, delay=1.0), drawn(2, 400, SIM)
     said = found.predict(bad)
@@ -314,6 +315,7 @@ def test_a_monitor_warns_before_a_walk_fails(walked, model):
     assert "area under the ROC curve" in str(m) and m.evaluations == len(bad.length) + 400
 
 
+@pytest.mark.long
 def test_a_monitor_of_what_the_user_observes(walked):
     """Simulated near misses and ordinary episodes, and an observation of the user's own."""
     sim, bad, _ = walked

@@ -156,6 +156,7 @@ def test_errors(call, said):
         call()
 
 
+@pytest.mark.long
 def test_equal_settings_compile_once():
     @jax.jit
     def traced(sim):

@@ -136,6 +136,7 @@ def test_where_failures_are_common(key, up):
     assert found.relative_error < 1.1 * np.sqrt((1 - truth) / truth / found.samples)
 
 
+@pytest.mark.long
 def test_the_draws_of_the_model_guarantee_an_interval(key):
     """P = 1.35e-3, beside a proposal: the first batch and a tenth or more of the last draws; a flag
     puts them before the estimate.
@@ -673,6 +674,7 @@ def test_samples_of_landing(key, proposal, moves):
         assert 0.1 < found.accepted < 0.9 and len(np.unique(e.x0)) > found.distinct
 
 
+@pytest.mark.long
 def test_samples_of_an_estimate(key, two):
     """Both modes by their shares; on the failing side of the planes; nearest ones likeliest."""
     sim, truth, estimate = two

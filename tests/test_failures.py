@@ -452,6 +452,7 @@ def test_failures_as_plain_numbers(tmp_path):
     assert float(rows[1]["x.pull"]) == float(found[2].disturbances["pull"][0])
 
 
+@pytest.mark.long
 def test_the_example_of_a_table_runs(tmp_path, monkeypatch, key, capsys):
     """What the docstring shows, with a walk of our own."""
     import textwrap

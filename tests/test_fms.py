@@ -202,6 +202,7 @@ def test_packets_and_events_are_those_of_the_second_implementation():
     assert 10 <= fails < len(xs)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "x, settings, fails",
     [

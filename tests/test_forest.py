@@ -107,6 +107,7 @@ def test_every_archived_failure_replays_to_the_bit():
         replays(archive.episode(i), RING, BONUS)
 
 
+@pytest.mark.long
 def test_every_episode_is_counted_once():
     result = once("ferry")
     assert result.episodes == EPISODES  # no root of S0 comes to an end so early
@@ -121,6 +122,7 @@ def test_the_archive_holds_the_best():
     np.testing.assert_array_equal(three.failures.episodes.x0, many.failures.episodes.x0[:3])
 
 
+@pytest.mark.long
 def test_the_first_failure_is_counted_in_the_order_of_simulation():
     result = once("landing")
     n = -(-result.first_failure // 6)  # the trees take turns
@@ -164,6 +166,7 @@ def test_a_result_is_readable():
     assert "more episodes;\n  the default reward, which ranks any failure above" in none
 
 
+@pytest.mark.long
 def test_random_starts_are_found():
     """x0 is chosen by the tree: it differs between failures, and the first root's children are
     starts.
@@ -336,6 +339,7 @@ def test_an_interrupted_search_says_so():
     json.dumps(result.settings)
 
 
+@pytest.mark.long
 def test_an_error_of_the_callback_ends_the_search_at_once():
     def fail(done, total, _):
         raise RuntimeError("enough")

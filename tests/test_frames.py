@@ -41,6 +41,7 @@ def test_failures_row_by_row(found):
     assert table["counts"].tolist() == found.failures.counts.tolist()
 
 
+@pytest.mark.long
 def test_failures_step_by_step_are_what_the_file_has(found, tmp_path):
     pandas = pytest.importorskip("pandas")
     table = found.failures.to_dataframe(steps=True)

@@ -196,6 +196,7 @@ def test_least_squares_are_those_of_numpy(kind, detail, x64):
     )
 
 
+@pytest.mark.long
 def test_a_polynomial_finds_a_paraboloid(x64):
     x = jnp.asarray(data(30, 3)[0])
     f = lambda x: (x[:, 0] - 1) ** 2 + x[:, 1] * x[:, 2] + 3

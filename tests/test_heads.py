@@ -722,6 +722,7 @@ def test_fields_are_as_documented():
     )
 
 
+@pytest.mark.long
 def test_moments_are_those_of_all_children_of_all_roots():
     """Also the numbers of samples that the lessons tell of."""
     result = once()

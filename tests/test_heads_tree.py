@@ -317,6 +317,7 @@ def edges_there(problem, tree, lane, places):
     return [np.asarray(a) for a in each]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("name", "candidates"), FERRY_ONE)
 def test_every_child_has_the_value_of_its_head(name, candidates):
     """Visited or waiting: those to be had, and with "one" the next after the last that was tried.
@@ -424,6 +425,7 @@ def test_pages_never_run_out(widening, candidates):
         assert (used <= there).all()
 
 
+@pytest.mark.long
 @given(
     k=st.floats(0.05, 30.0),
     alpha=st.floats(0.0, 1.0),
@@ -629,6 +631,7 @@ def test_vmap_over_heads_is_a_loop():
     assert (together[0] != together[1]).any() and (together[0] != together[2]).any()
 
 
+@pytest.mark.long
 def test_a_simulator_of_a_kind_and_heads_of_a_kind_do_not_recompile(traced):
     once("ferry")
     traced.clear()

@@ -401,6 +401,7 @@ def test_all_of_the_model_is_plain(key):
     assert found.k_hat == -np.inf
 
 
+@pytest.mark.long
 def test_a_proposal_that_does_not_cover(key):
     """Steps above 2.2 cannot be drawn: flagged, though the weights look fine."""
     found = importance(key, WALK, odd(2.2, -np.inf, 2.2), 10 * MORE)
@@ -422,6 +423,7 @@ def test_weights_that_are_nan(key):
         assert np.isfinite(found.log_mean)
 
 
+@pytest.mark.long
 def test_invalid_episodes(key):
     """A step of more than 3.2 gives NaN: no failure then, as in NumPy (400,000 episodes) within 4
     of both standard errors; counted, and said.

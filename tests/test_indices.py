@@ -54,6 +54,7 @@ def test_indices_of_a_plane(key, a, beta):
     assert str(found).splitlines()[1].startswith("x[0]") and "first order" in str(found)
 
 
+@pytest.mark.long
 def test_a_number_that_does_nothing_has_none(key):
     sim = plane((1.0, 0.0), 2.5)
     estimate = jast.estimate.failure_probability(key, sim, 10_000)

@@ -107,6 +107,7 @@ def test_a_black_box_runs_as_often_as_it_says():
     assert p.reliable and abs(p.mean / 5.0355e-5 - 1) < 4 * p.relative_error < 0.5
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "budget, gradients, error", [(1200, True, 0.06), (1200, False, 0.06), (300, True, 0.15)]
 )

@@ -233,6 +233,7 @@ def test_interruption_and_callback(key, equal, monkeypatch):
     equal(r.failures, monte_carlo(key, walk(), episodes=256).failures)
 
 
+@pytest.mark.long
 def test_progress_bar(key, capsys):
     monte_carlo(key, walk(), episodes=300, progress=True)
     assert "monte_carlo" in capsys.readouterr().err

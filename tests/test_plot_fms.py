@@ -74,6 +74,7 @@ def test_other_routes_are_drawn(x64):
     assert not empty[1].lines and len(lines(empty[0], "predicted path")[0]) == 2
 
 
+@pytest.mark.long
 def test_fms_asks_for_an_episode_of_its_own(x64):
     sim = fms()
     episode = jast.replay(sim, route())

@@ -51,6 +51,7 @@ def test_a_report_on_one_page(tmp_path):
     plt.close(figure)
 
 
+@pytest.mark.long
 def test_what_must_not_be_believed_says_so_and_why():
     doubt = estimate(reliable=False, warnings=("18% of what was found costs $5 " + "or so " * 30,))
     figure = plot.report(made(probability=doubt), nominal=0)

@@ -253,6 +253,7 @@ def two():
     return population(jax.random.key(1), SIDES, 200_000, particles=N)
 
 
+@pytest.mark.long
 def test_two_ways_agree_and_their_answer_holds(two):
     truth = 2 * stats.norm.sf(3)
     assert two.reliable and abs(two.log_mean - np.log(truth)) < 4 * two.relative_error

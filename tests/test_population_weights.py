@@ -38,6 +38,7 @@ def test_gaussians_of_the_failures_draw_the_last_part(plane):
     assert plane.interval[0] < stats.norm.sf(4) < plane.interval[1]
 
 
+@pytest.mark.long
 def test_what_populations_left_stays(plane, key):
     """Their failures, as a `Sample`; the draws, which further answers use, are those of Gaussians;
     the model's own draws guarantee an interval.

@@ -113,6 +113,7 @@ def test_pendulum_step():
 # autoregression
 
 
+@pytest.mark.long
 def test_autoregression_truth(key):
     coarse, fine = (autoregression_probability(0.1, 5.0, 100, n) for n in (150, 220))
     assert coarse == pytest.approx(fine, rel=1e-9)

@@ -46,6 +46,7 @@ def test_it_shares_the_way_evenly_on_both_sides(learned):
     assert "lambda" in str(learned) and learned.episodes >= 4000
 
 
+@pytest.mark.long
 def test_importance_sampling_by_it_agrees_with_the_truth(learned):
     proposal = jast.estimate.policy_proposal(TWO_STEPS, learned)
     found = jast.estimate.importance(jax.random.key(5), TWO_STEPS, proposal, 20_000)

@@ -101,6 +101,7 @@ def test_a_repr_is_short_and_the_table_of_a_notebook_names_every_field(name):
     assert table.count("<tr>") == table.count("</tr>") >= len(fields) and len(table) < 5000
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", mark_long(MAKERS, "sac"))
 def test_every_result_has_the_whole_vocabulary(name):
     value = made(name)
@@ -248,6 +249,7 @@ def same(a, b, at="result"):
 FILED = [*MAKERS, "episode", "failures", "heads", "traces", "history", "roots"]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", mark_long(FILED, "sac"))
 def test_a_file_gives_the_result_back_to_the_bit(name, tmp_path):
     value, path = made(name), tmp_path / "result"

@@ -246,6 +246,7 @@ def test_float64(key):
         assert off(found, TRUTH) < MAX_ERRORS
 
 
+@pytest.mark.long
 def test_steps_and_episodes_are_counted(key):
     """Every episode of a system that neither ends nor fails before its horizon has all steps, and a
     branch only those after it.

@@ -207,6 +207,7 @@ def test_weights_average_to_one(mixed, key, gates):
     np.testing.assert_allclose(on_host, ratio[:, :3], atol=2e-3)
 
 
+@pytest.mark.long
 def test_a_known_tilt_is_found(mixed):
     """Traces of one tilt, of equal weights, give its means and odds back."""
     f = TiltFamily(mixed, 200_000, search_context(jax.random.key(2)))

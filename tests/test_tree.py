@@ -416,6 +416,7 @@ def test_a_node_costs_its_edges_and_its_state():
     assert a_node(large(1000), "node") - a_node(large(0), "node") == 4000
 
 
+@pytest.mark.long
 def test_trees_that_do_not_fit_are_refused_with_the_numbers():
     ran = []
     with pytest.raises(

@@ -390,6 +390,7 @@ def test_what_cannot_be_sent_is_named(monkeypatch):
             squares(function=lambda s, n, p: np.array(n), executor=executor)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", [n for n in CALLS if n not in LATER])
 def test_bad_places_are_named(name, key, tmp_path):
     call, other = CALLS[name], CALLS["monte_carlo" if name == "nominal" else "nominal"]

@@ -165,6 +165,7 @@ def test_adam_by_hand(key, size, steps):
     assert losses.shape == (steps,) and np.isfinite(losses).all()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("batch", [1, 3, 7, 10])
 def test_an_epoch_is_every_row_once(key, batch):
     codes, failed = (
@@ -244,6 +245,7 @@ def test_the_autoencoder_comes_back_from_the_key(encoded_digits):
         encoded(other, inputs, labels)
 
 
+@pytest.mark.long
 def test_the_thesis_figures(encoded_digits):
     result, inputs, _, failed, networks = encoded_digits
     middle = float(np.median(result.scores))
