@@ -19,6 +19,7 @@ from jast._src.estimate import failure_probability as module
 from jast._src.estimate.estimate import flag_imprecise
 from jast._src.estimate.population import answer
 from jast._src.estimate.population import descents as ways
+from jast._src.estimate.population import search as populations
 from jast._src.estimate.population.failure_sample import Sample
 from jast._src.estimate.population.particle_moves import (
     Particles,
@@ -30,6 +31,8 @@ from jast._src.estimate.population.particle_moves import (
 )
 from jast._src.estimate.population.search import MAX_WITNESS_ERROR, answer_of
 from jast._src.normal_space.transform import normal_numbers, outcomes
+from jast._src.runtime import work
+from jast._src.runtime.progress_bar import Watch
 from jast.estimate import failure_probability, failure_samples, population
 from jast.simulators import limit_state, walk1d
 
@@ -288,6 +291,58 @@ def test_the_same_bits_wherever_populations_run(two, tmp_path):
     others += [call(checkpoint=tmp_path / "kept"), call(checkpoint=tmp_path / "kept")]
     assert {o.log_mean for o in others} == {two.log_mean}
     assert {o.interval for o in others} == {two.interval}
+
+
+@pytest.fixture
+def slow_chains(key, monkeypatch):
+    """(A search by chains that mix slowly, as of a closed loop whose controller rests, the kinds
+    that ran): with 10 moves wide noise comes to a third of the truth, with 20 to two thirds, with
+    40 to all, and no error says so.
+    """
+    ran = []
+
+    def chain(way):
+        def run(key, sim, n, moves, capacity, **about):
+            ran.append((way, moves))
+            short = {10: 1 / 3, 20: 2 / 3}.get(moves, 1.0) if way == "width" else 1.0
+            none = np.zeros((0, 2), np.float32)
+            return ways.Descent(
+                points=none,
+                used=np.zeros(0, np.int32),
+                distance=none[:, 0],
+                family=np.zeros(0, np.int64),
+                log_mean=np.float64(np.log(1e-6 * short)),
+                variance=np.float64(0.003 * N / n),
+                plain=np.array([0, 0, n]),
+                levels=np.ones(3),
+                evaluations=np.int64(10 * n * moves),
+                invalid=np.int64(0),
+                size=np.int64(n),
+            )
+
+        return run
+
+    monkeypatch.setattr(populations, "DESCENTS", {w: chain(w) for w in ways.DESCENTS})
+    with Watch("population", 10**7, "episode", False, None) as watch:
+        search = populations.PopulationSearch(key, SIDES, 10**7, N, 2 * N, watch, work.HERE)
+        for way in ways.DESCENTS:
+            search.run(search.first_kind(way), 1)
+        yield search, ran
+
+
+def test_ways_that_disagree_move_twice_as_often(slow_chains):
+    search, _ = slow_chains
+    kinds = search.compare(search.choose_kinds())
+    assert {k.way: k.moves for k in kinds} == {"distance": 20, "width": 40}
+    assert search.spent <= 10**7 and search.agree(kinds)
+
+
+def test_nothing_more_is_run_after_an_interruption(slow_chains):
+    search, ran = slow_chains
+    kinds = search.choose_kinds()
+    before = list(ran)
+    search.note_interruption()
+    assert search.compare(kinds) == kinds and ran == before
 
 
 def test_what_misleads_the_distance_is_not_missed_silently(key):

@@ -70,12 +70,12 @@ def population(
     further populations, it draws the last part (importance sampling), down to a standard error of
     half a per cent, and the populations check it.
 
-    Two ways that know nothing of each other must agree within three standard errors. Where only one
-    of them reaches failures, its moves are doubled until its answer stays. The model's own draws,
+    Two ways that know nothing of each other must agree within three standard errors; where they do
+    not, both go again with twice the moves, while the budget lasts. Where only one of them reaches
+    failures, its moves are doubled until its answer stays. The model's own draws,
     with which each population begins, are a third witness. Otherwise the estimate is UNRELIABLE and
     says which way saw what; so it is with a relative standard error above 5 %, and with coarse
-    floats. Where plain draws tell the probability soonest, it draws
-    plainly.
+    floats. Where plain draws tell the probability soonest, it draws plainly.
 
     A failure mode that no way meets is missing without a sign. A KeyboardInterrupt ends it with the
     estimate of the populations that are done, and is raised where there is none. Host loop, not for
@@ -177,12 +177,12 @@ def by_populations(
         )
         search.run(search.first_kind("distance"), 1)
         plain = search.plain_is_best()
-        if not plain and not search.interrupted:
+        if not plain:
             search.run(search.first_kind("width"), 1)
         kinds, by_weights = () if plain else search.choose_kinds(), None
         if not kinds:  # plain draws are all that tells the probability
             return estimate_from_plain_draws(search, name, level)
-        search.run_witness(kinds)
+        kinds = search.compare(kinds)
         if len(kinds) == 2 and not search.interrupted:
             by_weights = importance_estimate(search, name, kinds, level)
         if by_weights is None:

@@ -98,7 +98,9 @@ class PopulationSearch:
         return Kind(way, getattr(SETTINGS, f"moves_by_{way}"))
 
     def run(self, kind, count, n=None):
-        """``count`` more populations of a kind, of ``n`` points."""
+        """``count`` more populations of a kind, of ``n`` points; none after an interruption."""
+        if self.interrupted:
+            return
         before, n = self.runs.get(kind, ()), self.n if n is None else n
         # the first one shows what it costs
         most = math.inf if before else WITNESS_SHARE * self.budget / 2
@@ -174,11 +176,11 @@ class PopulationSearch:
             return seen
         # one way alone: its moves are doubled until its answer stays
         before, doubled = seen[0], seen[0].doubled
-        while self.spent + self.n * self.cost(doubled) <= self.budget and not self.interrupted:
+        while self.spent + self.n * self.cost(doubled) <= self.budget:
             self.run(doubled, 1)
-            if (answer := self.answer(doubled)) is None:
+            if self.answer(doubled) is None:
                 break
-            if self.answer(before).apart(answer) <= MAX_DISAGREEMENT:
+            if self.agree((before, doubled)):
                 return self.sorted_by_cost([doubled, before])
             before, doubled = doubled, doubled.doubled
         return (before,)
@@ -187,18 +189,35 @@ class PopulationSearch:
         """The ``kinds``, those first whose variance costs least."""
         return tuple(sorted(kinds, key=lambda k: self.answer(k).relative ** 2 * self.cost(k)))
 
-    def run_witness(self, kinds):
-        """Spend a third of all on the second of two ways."""
-        if len(kinds) == 2 and kinds[0].way != kinds[1].way:
+    def compare(self, kinds):
+        """Spend a third of all on the second of two ways. Where they do not agree, both begin anew
+        with twice the moves, as the more slowly mixing one may be wrong within its error. Returns
+        the kinds that were compared last.
+        """
+        while len(kinds) == 2 and kinds[0].way != kinds[1].way:
             share = WITNESS_SHARE * self.budget - self.evaluations(kinds[1])
             self.fill(kinds[1], min(share, self.budget - self.spent))
+            doubled = tuple(k.doubled for k in kinds)
+            cost = self.n * sum(map(self.cost, doubled))
+            if self.agree(kinds) or self.spent + cost > self.budget:
+                break
+            for kind in doubled:
+                self.run(kind, 1)
+            if any(self.answer(kind) is None for kind in doubled):
+                break
+            kinds = self.sorted_by_cost(doubled)
+        return kinds
+
+    def agree(self, kinds):
+        """Whether two kinds agree within their errors."""
+        return self.answer(kinds[0]).apart(self.answer(kinds[1])) <= MAX_DISAGREEMENT
 
     def fill(self, kind, evaluations):
         """Populations of this kind, alike in size, for so many ``evaluations``."""
         points, most = evaluations / self.cost(kind), min(2 * self.n, self.capacity)
         count = max(math.ceil(points / most), 1)
         n = int(points / count) // BLOCK * BLOCK
-        if n >= min(MIN_POINTS, self.n) and not self.interrupted:
+        if n >= min(MIN_POINTS, self.n):
             self.run(kind, int(points) // n, n)  # what whole blocks of lanes leave is one more
 
 
