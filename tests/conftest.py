@@ -40,9 +40,9 @@ that needs the optimised compiler is marked long (soft actor-critic learns NaN w
 
 
 def pytest_configure(config):
-    """The short tests are compiled quickly, the long ones are optimised."""
-    short = config.option.markexpr == "not long"
-    os.environ.setdefault("XLA_FLAGS", QUICK if short else OPTIMISED)
+    """Short and slow tests are compiled quickly, the long ones are optimised."""
+    quick = config.option.markexpr in ("not long and not slow", "slow and not long")
+    os.environ.setdefault("XLA_FLAGS", QUICK if quick else OPTIMISED)
 
 
 @pytest.hookimpl(tryfirst=True)

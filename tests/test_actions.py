@@ -39,7 +39,7 @@ def models(dtype):
     )
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("model", list(models("float32")))
 @pytest.mark.parametrize("kind", list(kinds("float32")))
 def test_locate_inverts_at(kind, model, dtype, key):
@@ -149,7 +149,7 @@ def test_a_box_with_ends_for_each_part_is_the_boxes_of_its_parts(key):
     assert (draws["b"].max(0) > 3.9).all()
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_check_says_what_is_wrong_with_the_ends_of_a_box():
     joint = lambda s: D.Joint({"a": D.Normal(0.0, 1.0), "b": D.Normal(0.0, 1.0)})
     sim = jast.Simulator(
@@ -194,7 +194,7 @@ def test_a_box_may_have_no_width_or_traced_ends():
     assert width(1.0) == -1.0
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("search", mark_long(["monte_carlo", "cem", "mcts"], "cem", "mcts"))
 def test_searches_draw_from_the_proposal_and_score_by_the_model(key, search):
     """Of landing: drifts from N(.2, .01^2), so that all fail; offsets at the start from the

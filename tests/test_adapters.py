@@ -92,7 +92,7 @@ def pushed(state, x):
     return state._replace(x=state.x + x)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", NOISES)
 def test_the_probability_is_that_of_the_closed_loop(kind, key):
     """Of ten steps with the pole 1.1 - .6, whose end is normal; a force is let pass by the pole and
@@ -104,7 +104,7 @@ def test_the_probability_is_that_of_the_closed_loop(kind, key):
     within(monte_carlo(key, sim, SAMPLES), stats.norm.sf(1.0 / sd))
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("wide", [False, True], ids=["float32", "float64"])
 def test_an_episode_is_that_of_a_loop_in_numpy(wide):
     with jax.enable_x64(wide):
@@ -123,7 +123,7 @@ def test_an_episode_is_that_of_a_loop_in_numpy(wide):
     assert states.time[int(episode.length)] == episode.length
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_what_terminates_is_a_failure_and_is_not_reset():
     sim = drift(action=Normal(jnp.zeros(1), 1.0), gain=1.1)
     rows = {"action": jnp.zeros((5, 1)).at[2].set(3.5)}
@@ -149,7 +149,7 @@ def test_gradients_go_through_what_the_environment_stops():
     np.testing.assert_allclose(slopes[:, 0], [1.21, 1.1, 1.0], rtol=1e-6)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_parameters_are_drawn_once_an_episode(key):
     """x_1 is a uniform pole times a start near 1; and by a pair, by which the limit goes, too."""
     start = (Normal(0.0, 1e-3), lambda state, x: state._replace(x=state.x * 0 + 1.0 + x))
@@ -162,7 +162,7 @@ def test_parameters_are_drawn_once_an_episode(key):
     assert set(jast.rollout(key, sim).x0) == {"parameters"}
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_failures_are_seeds_where_only_seeds_are_drawn(key):
     """The start is the normal number of the episode's key; a fixed seed is one start."""
     above = dict(failure=lambda now: now.state.x[0] > 1.0)
@@ -180,7 +180,7 @@ ANY = dict(force=(Normal(0.0, 1.0), lambda state, x: state))
 NONE = {"force": jnp.zeros(1)}
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_seeds_of_a_step_are_disturbances(key):
     sim = jast.check(drift(Drift(1.0), seed="step", horizon=1, gain=1.1, **LAST))
     episode = jast.rollout(key, sim)
@@ -225,7 +225,7 @@ class Picture(Drift):
         return jnp.zeros((9, 9)), super().reset(key, params)[1]
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_what_is_observed(key):
     noise = dict(action=Normal(jnp.zeros(1), 1.0))
     state = jast.replay(drift(**noise), {"action": jnp.ones((1, 1))}).states
@@ -261,7 +261,7 @@ def team(**settings):
     return gymnax(Team(), None, lambda seen: {k: -0.5 * v[0] for k, v in seen.items()}, **settings)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_several_agents_without_params(key):
     """Each is .5 x - .5 noise; the first of two ends above 1."""
     noise = {"a": Normal(jnp.zeros(1), 1.0), "b": Independent(Normal(jnp.zeros(1), 1.0), 1)}
@@ -318,7 +318,7 @@ def cart(env=None, **settings):
     return brax(env or Cart(), Partial(steer, jnp.array(0.6)), horizon=10, **settings)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_brax_to_its_end(key):
     """Ten steps, though the time is over after eight; and by the closed loop's own numbers."""
     ending = dict(failure=lambda now: (now.time == 10) & (now.observation[0] > 1.0))
@@ -329,7 +329,7 @@ def test_brax_to_its_end(key):
     assert failing.failure and failing.length == 1
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_brax_by_parameters_and_a_force(key):
     def heavier(env, x):
         env.pole = x
@@ -389,7 +389,7 @@ def couple(env=None, **settings):
     return jumanji(env or Couple(), lambda seen: -0.5 * seen.x, horizon=10, **settings)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_jumanji_to_its_end(key):
     """Ten steps of x' = .5 x + noise, though the time is over after eight."""
     ending = dict(failure=lambda now: (now.time == 10) & (now.observation.x[0] > 1.0))
@@ -435,7 +435,7 @@ def against_chance(env, first, horizon, **settings):
     return pgx(env, policy, horizon=horizon, action=(other, filled), **settings)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_pgx_is_its_game_tree(key):
     """Who takes one with 1, 2, 3, 4 left loses 1, 0, 1/2, 1/3, and 1/2 with 5; second, (1/3 + 1/2 +
     0) / 3.
@@ -485,7 +485,7 @@ def body(**settings):
     return mjx(jnp.array(2.0), Data(), held, **settings)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("substeps", [1, 3])
 def test_mjx_is_that_of_a_loop_in_numpy(substeps, key):
     sim = jast.check(body(force=Normal(jnp.zeros(1), 1.0), substeps=substeps))
@@ -501,7 +501,7 @@ def test_mjx_is_that_of_a_loop_in_numpy(substeps, key):
     assert not episode.failure
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_mjx_fails_at_its_distance_and_by_its_parameters(key):
     """One step of a force of 50: qpos = .1 + .01 (50 - .3) / mass."""
     light = (Uniform(1.0, 2.0), lambda mass, x: x)
@@ -613,7 +613,7 @@ class Wrapped:
         return getattr(Drift(), name)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("message", WRONG)
 def test_what_is_refused(message):
     with pytest.raises(ValueError, match=message):

@@ -85,7 +85,7 @@ def within(value, interval, truth, level=0.95, errors=4.0):
     return abs(truth - value) <= errors / norm.ppf((1 + level) / 2) * half
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_the_curve_is_that_of_the_plane(found):
     u = np.array([-0.8, -0.4, 0.0, 0.3, 0.6, 4.0])
     c = exceedance(found, u)
@@ -102,7 +102,7 @@ def test_the_curve_is_that_of_the_plane(found):
     assert exceedance(found, u, level=0.5).high[2] < c.high[2]
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_nothing_is_said_of_what_few_draws_tell(found):
     c = exceedance(found, [-60.0, -3.0])
     assert np.isnan(c.probability).all() and not c.reliable.any()
@@ -183,7 +183,7 @@ def test_first_passage_times(key):
     assert abs(t.mean - mean) < 4 * 6 / np.sqrt(e.failing)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_episodes_of_drawn_policies_are_made_again(key):
     """The sides of the walk, and what a whole episode shows, of plain draws and of a proposal."""
     sim, up = walk1d(threshold=5.0), {"up": lambda s: s > 0}

@@ -19,7 +19,7 @@ from jast.specs import always, parts, predicate, robustness, trace_of
 CORNERS = np.random.default_rng(2).integers(0, 2, (20, 2)).astype(float)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_the_first_switch_is_where_the_closed_form_has_it():
     """At full throttle y1 = -t^2 / 2. The gap of 10 + t^2 / 2 reaches 15 at sqrt(10) s, and then
     grows by y2' = -(t - sqrt(10)).
@@ -92,7 +92,7 @@ def test_switches_are_located(seed, x64):
     assert away.max() < 3e-3
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_precisions_agree():
     times = 5.0 * np.arange(20)
     single, _ = simulate("chasing cars", times, CORNERS)
@@ -149,7 +149,7 @@ def test_as_many_fail_as_in_another_transcription(key):
     assert abs(found - share) < 4 * np.sqrt(share * (1 - share) * (1 / n + 1 / 20_000))
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_published_inputs_falsify():
     """FalCAuN's (MasWag/FalCAuN-ARCH-COMP, MIT licence). Its version of 2023 reads the outputs
     where inputs change; its three signals for CC3 that end at 20 s do not falsify.
@@ -206,7 +206,7 @@ def shifted(inputs, until):
     return np.array(out)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_the_transmission_is_what_its_equations_say(x64):
     """Up to the third gear, and down again when full throttle asks for it."""
     inputs = np.array([[50.0, 0.0], [100.0, 0.0], [10.0, 200.0]])
@@ -220,7 +220,7 @@ def test_the_transmission_is_what_its_equations_say(x64):
     np.testing.assert_allclose(np.asarray(trace.speed)[1:n], expected[:, 1], atol=0.01)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_transmission_under_its_requirement(key):
     sim = automatic_transmission("AT6abc")
     assert sim.horizon == 10

@@ -42,7 +42,7 @@ LAST = SETTINGS._replace(audits=1)
 """One audit, after which nothing can be mended."""
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_lost_mode_is_taken_into_the_proposal(key):
     """It is as likely as what is known: half of the draws go there in the end."""
     f, state = searched(key, planes(4.0, 4.0), 1.0)
@@ -60,7 +60,7 @@ def test_what_the_last_audit_finds_is_a_reason(key):
     assert "failures that the proposal hardly draws" in state.reasons[0]
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("down, shares", [(FAR, (1.0,)), (4.0, (0.5, 0.5)), (4.0, (0.995, 0.005))])
 def test_nothing_is_said_where_nothing_was_lost(down, shares, key):
     """One mode; two; and a second one that the proposal draws seldom, but often enough for its
@@ -168,7 +168,7 @@ def test_shares_beyond_the_whole_are_in_words():
     assert said == ["3% of", "30% of", "1 times", "14 times", "far more than"]
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, 4, 7, 15])
 def test_an_island_that_levels_pass_by_is_found_by_walks(seed):
     """Of ``squares`` 6.5 % lie in a small square far behind the boundary of a large one. Without

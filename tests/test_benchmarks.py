@@ -138,7 +138,7 @@ SETTINGS = {
 }
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("name", mark_long(SMALLEST, *SLOW))
 def test_a_benchmark_runs(name, as_users_have_it, monkeypatch, capsys):
     skip_without(NEEDS_SMALLEST.get(name, []))

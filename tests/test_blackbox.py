@@ -56,7 +56,7 @@ class Looks(blackboxes.Walk):
         return np.arange(135.0) + self.s
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_episodes_are_those_of_the_system_in_jax_and_counted_once(key):
     sim = box(blackboxes.walk, 4)
     ours, theirs = (
@@ -96,7 +96,7 @@ def test_objects_are_those_of_the_system_in_jax():
     assert incidents(sim) == ()
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_an_object_is_judged_at_every_state_unless_said_otherwise(key):
     leaves = jast.Simulator(
         lambda x0: jnp.zeros(()),
@@ -116,7 +116,7 @@ def test_an_object_is_judged_at_every_state_unless_said_otherwise(key):
     assert not box(lambda: blackboxes.Leaves()).episodic
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_check_says_where_failures_on_the_way_are_lost():
     sim = box(blackboxes.Leaves, 8, episodic=True)
     with pytest.warns(
@@ -157,7 +157,7 @@ def test_observations_of_an_environment_that_are_no_numbers_are_left_out():
     assert sim.init(()).seen.shape == (0,) and sim.observe(sim.init(())).shape == (2,)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_tree_counts_what_the_host_runs(key):
     sim = box(blackboxes.walk, 3)
     found = jast.search.mcts(key, sim, simulations=60)
@@ -227,7 +227,7 @@ def test_what_goes_wrong_is_counted_with_an_example():
     assert [(i.kind, i.count) for i in new_incidents(before, incidents(sim))] == [("raised", 1)]
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_search_goes_on_without_the_invalid_episodes(key):
     sim = box(blackboxes.Fragile, 3, episodic=False)
     found = jast.search.monte_carlo(key, sim, episodes=128, top=2)
@@ -242,7 +242,7 @@ def test_a_search_goes_on_without_the_invalid_episodes(key):
     assert len(only.disturbances) <= 3 and only.disturbances.sum() > 2
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_another_outcome_of_the_same_disturbances_is_seen(key):
     sim = box(blackboxes.Forgetful, 3)
     found = jast.search.cem(key, sim, samples=32, iterations=2, **TOLD)
@@ -315,7 +315,7 @@ def test_seeds_are_the_disturbance_of_a_system_of_unknown_density():
     np.testing.assert_allclose(seen, [1, float(episode.disturbances[1]) / 2**32], rtol=1e-6)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("episodic", [False, True])
 @pytest.mark.parametrize(
     "system, likelihood",
@@ -337,7 +337,7 @@ def test_what_a_system_says_of_its_seeds_is_their_likelihood(key, system, likeli
     assert again.log_prob == episode.log_prob and again.reward == episode.reward
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_failures_by_seeds_are_ranked_by_what_the_system_says(key):
     """The likeliest of 400 episodes comes first; without a word from the system all are alike."""
     found = jast.search.monte_carlo(key, box(blackboxes.Sampled, 4, None), episodes=400, top=5)
@@ -351,7 +351,7 @@ def test_failures_by_seeds_are_ranked_by_what_the_system_says(key):
     assert (np.asarray(silent.failures.episodes.log_prob) == 0).all()
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_requirement_keeps_what_the_system_says(key):
     sim = box(blackboxes.Sampled, 4, None)
     plain = jast.rollout(key, sim)
@@ -363,7 +363,7 @@ def test_a_requirement_keeps_what_the_system_says(key):
         np.testing.assert_allclose(under.log_prob, plain.log_prob, rtol=1e-6)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_likelihood_that_is_none_makes_an_episode_invalid(key):
     functions = (
         (lambda x: (3.0, True, 1.0), "prob", 0.0, np.log(3.0)),
@@ -571,7 +571,7 @@ def test_objects_serve_many_episodes(monkeypatch):
     np.testing.assert_allclose(reply.distance, np.maximum(4 - rows[:, :2].sum(1), 0))
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_an_example_ends_where_it_went_wrong(key):
     sim = box(blackboxes.Fragile, 6)
     jast.search.monte_carlo(key, sim, episodes=64, top=2)

@@ -70,7 +70,7 @@ def gone(pids, seconds=10.0):
     return not any(map(alive, pids))
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_what_hangs_or_dies_costs_its_own_row_only():
     sim = box(blackboxes.troubled)
     first = np.r_[10.0:17.0, 1, 10.0:13.0, 2, 3, 10.0:20.0, 4, 5]
@@ -117,7 +117,7 @@ class Hangs(blackboxes.Leaves):
         return False
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_check_looks_on_the_way_in_a_worker():
     settings = dict(horizon=8, episodic=True, workers=1)
     said = []
@@ -191,7 +191,7 @@ class Broken(blackboxes.Walk):
         os._exit(1)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_bad_input_is_named(monkeypatch):
     lock = threading.Lock()
     with pytest.raises(ValueError, match="system cannot be sent to a worker process: .*lock"):

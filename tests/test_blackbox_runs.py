@@ -88,7 +88,7 @@ def test_a_system_that_answers_otherwise_is_no_longer_remembered(key):
     assert only.disturbances.tolist() == [1, 1]
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", SYSTEMS)
 def test_nominal_runs_what_it_was_asked(key, kind):
     """And the undisturbed episode, which is the one that is made twice."""
@@ -289,7 +289,7 @@ print(found.episodes, found.failing)
 """
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_killed_search_goes_on_without_running_anything_twice(tmp_path):
     log, folder = tmp_path / "runs.log", tmp_path / "checkpoint"
     code = KILLED.format(tests=os.path.dirname(__file__), log=str(log), folder=str(folder))

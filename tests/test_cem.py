@@ -124,7 +124,7 @@ def test_trees_are_independent_of_their_number(key, equal):
     }
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_counts_of_repetitions(key):
     """One failure only: every time it was found is counted."""
     sim = jast.Simulator(
@@ -139,7 +139,7 @@ def test_counts_of_repetitions(key):
     assert r.failures.counts.sum() == r.failures.seen == round(r.failing_share * 400)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_invalid_episodes_are_counted_and_never_elite(key):
     r = cem(key, walk(step=lambda s, x: jnp.where(x > 1.5, jnp.nan, s + x)), **SMALL)
     assert 0 < r.invalid < 600
@@ -154,7 +154,7 @@ def test_invalid_episodes_are_counted_and_never_elite(key):
     assert r.first_failure is None
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_systems_that_never_or_always_fail(key):
     r = cem(key, walk(fails=lambda s: s > 1e9), **SMALL)
     assert (r.failing_share, r.first_failure, r.failures.size, r.steps) == (
@@ -168,7 +168,7 @@ def test_systems_that_never_or_always_fail(key):
     assert r.failures.size == 1 and r.failures.counts.tolist() == [r.failures.seen] == [2000]
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_under_jit_and_vmap(key):
     betas = jnp.array([3.0, 4.0])
     search = lambda sim, smoothing=0.3: cem(
@@ -229,7 +229,7 @@ def test_bad_simulator(key):
         cem(key, two_densities())
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_leads_on_from_known_failures(key):
     """Phi(-6) = 1e-9: no draw of the model is near, but a known failure at (4, 4, 4, 4) is."""
     sim, reward = hyperplane(6.0), rewards.Partial(_distance_first)

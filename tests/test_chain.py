@@ -110,7 +110,7 @@ def test_goes_to_failures_that_no_draw_reaches(key):
     assert -200 < r.best.reward <= -100
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_nan_is_counted_and_never_best(key):
     r = chain(key, far(40.0, lambda s: jnp.where(s > 5, jnp.nan, 40 - s)), **SMALL)
     assert r.invalid

@@ -253,7 +253,7 @@ class Shifted(D.Uniform):
         return super().sample(seed=seed, sample_shape=sample_shape) + 7
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("name", NUMBERS)
 def test_numbers(name):
     changes, match = NUMBERS[name]
@@ -312,7 +312,7 @@ GOOD = dict(
 )
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("name", GOOD)
 def test_good_simulators_pass(name):
     sim = GOOD[name]()
@@ -324,7 +324,7 @@ def test_good_simulators_pass(name):
 # actions
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_actions():
     assert jast.check(ferry(), actions.uniform(0.0, 1.0))
     assert jast.check(ferry(), actions.quantiles())
@@ -516,7 +516,7 @@ def test_a_host_callback_that_raises():
         jast.check(line(step=step))
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_no_key_is_used_twice(key):
     with jax.debug_key_reuse(True):
         sim = ferry(adversary=(16.5, 0.0))

@@ -25,7 +25,7 @@ def cached(monkeypatch):
     return calls
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_compiled_programs_are_kept_unless_told_otherwise(capsys, tmp_path, cached):
     run(capsys, tmp_path, "--method", "monte-carlo", "--no-cache")
     assert cached == []
@@ -33,7 +33,7 @@ def test_compiled_programs_are_kept_unless_told_otherwise(capsys, tmp_path, cach
     assert cached == ["cache"]
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_call_goes_on_where_no_program_can_be_kept(capsys, tmp_path, monkeypatch):
     def full():
         raise ValueError("cache: folder must be one that can be made")
@@ -49,7 +49,7 @@ def run(capsys, tmp_path, *argv):
     return status, capsys.readouterr().out, tmp_path / "out"
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["forest", "mcts", "cem", "monte-carlo"])
 def test_every_method_reports_and_saves(capsys, tmp_path, method):
     status, text, out = run(
@@ -84,7 +84,7 @@ def walk():
 """
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_stress_of_a_system_of_ones_own(capsys, tmp_path):
     (tmp_path / "own.py").write_text(OWN)
     command = [f"{tmp_path / 'own.py'}:walk", "--budget", "600", "--quiet"]
@@ -223,7 +223,7 @@ def test_interrupted_at_once(capsys, tmp_path, monkeypatch):
     assert "interrupted before there was a result" in capsys.readouterr().err
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_interrupted_search_reports_what_was_done(capsys, tmp_path, monkeypatch):
     whole = cli.forest
 

@@ -362,7 +362,7 @@ CHECKED = mark_long(
 )
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("scenario, kinds", CHECKED, ids=str)
 def test_contract(scenario, kinds):
     sim = colav(scenario, kinds)
@@ -383,7 +383,7 @@ def test_disturbances_are_a_dict_where_there_are_several():
     assert {k: a.shape for k, a in start(*KINDS).items()} == shapes
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_dtypes(flown):
     def floats(tree):
         return {
@@ -515,7 +515,7 @@ def test_a_longer_horizon_goes_on_as_a_shorter_one(flown):
 # undisturbed
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_the_undisturbed_ferry_keeps_ten_metres(key):
     """Measured: head-on 16.09, crossing 25.41, sharp turn 15.65 m; overtaking, in the test above,
     14.10 m.
@@ -531,7 +531,7 @@ def test_the_undisturbed_ferry_keeps_ten_metres(key):
         assert float(found.distance) == pytest.approx(expected, abs=0.02)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_collision_avoidance_is_worth_metres_in_every_scenario(flown):
     """With the order kept at the desired speed the second model comes to 0.9, 8.2, 12.9 and 9.0 m:
     head-on is a collision, the others are near misses.
@@ -757,7 +757,7 @@ def test_mirrored_starts_have_mirrored_paths():
     assert np.abs(left[0][:, 5, 1]).max() > 0.5
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_ferry_is_first_order_in_the_substep(flown):
     """Against Runge-Kutta, with the orders of the published scenarios and from starts aside of the
     path. Measured over 75 s at 30 substeps: 9 cm, 2 cm/s.
@@ -789,7 +789,7 @@ def test_ferry_is_first_order_in_the_substep(flown):
     assert errors[1].max() < 0.1 and slips[1].max() < 0.05
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_flown_ferries_are_those_of_the_second_model(flown, sailed):
     """The default 30 substeps, with the planner's orders as they came. Measured: 9 cm."""
     worst = 0
@@ -1331,7 +1331,7 @@ def test_delays_outside_of_the_unit_interval_are_clipped(flown):
     np.testing.assert_array_equal(beyond.states.delay[1:], np.tile([1.0, 0.0], STEPS)[:STEPS])
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["delay", "steering"])
 def test_after_an_impossible_disturbance_the_next_has_a_density(kind):
     sim = colav(disturbances=kind)
@@ -1357,7 +1357,7 @@ def distances(name, flown, sailed, records):
     return np.hypot(*gap.T)[1 : SUBSTEPS * length + 1].reshape(length, SUBSTEPS)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_miss_distance_is_the_least_at_substeps(flown, sailed, records):
     """Measured: 5 cm, the two vessels' errors at 30 substeps."""
     worst = 0
@@ -1591,7 +1591,7 @@ def test_a_traced_delay_beyond_the_buffer_is_that_of_the_buffer():
         np.testing.assert_array_equal(far, most)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_scales_may_be_arrays_and_are_refused_by_name():
     assert jast.check(colav(disturbances="noise", noise=np.array([0.3, 0.1]))).horizon == STEPS
     with pytest.raises(ValueError, match="colav: delay_change must be a positive number"):

@@ -60,7 +60,7 @@ def told(folder, seed=0, flags=""):
     return float(mean), *map(int, counts.split())
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_the_next_process_compiles_nothing(tmp_path):
     first, hits, compiled = told(tmp_path)
     assert hits == 0 and compiled > 0
@@ -69,7 +69,7 @@ def test_the_next_process_compiles_nothing(tmp_path):
     assert told(tmp_path, seed=1)[2] == 0
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.skipif(platform.machine() != "x86_64", reason="the flag is of x86")
 def test_programs_for_other_cpu_features_are_not_read(tmp_path):
     _, _, compiled = told(tmp_path)

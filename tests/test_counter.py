@@ -47,7 +47,7 @@ def bits(word):
     return ((word[..., None] >> np.arange(32, dtype=np.uint32)) & 1).astype(np.int8)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", SEEDS)
 def test_bits_and_bytes_are_uniform(seed):
     for word in streams(seed):
@@ -57,7 +57,7 @@ def test_bits_and_bytes_are_uniform(seed):
             assert scipy.stats.chisquare(np.bincount(byte, minlength=256)).pvalue > 1e-6
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", SEEDS)
 def test_neighbouring_words_are_uncorrelated(seed):
     for word in streams(seed):

@@ -65,7 +65,7 @@ def test_the_method_is_that_of_algorithm_1(mode, key, x64):
         np.testing.assert_allclose(proposal.covariance, np.cov(elite.T, bias=True), rtol=1e-9)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_the_surrogate_sees_what_it_may_remember(key, x64):
     counts = (6, 2, 4, 3, 5)
     for memory, best in ((1, 0), (2, 0), (2, 3), (3, 4), (9, 5)):
@@ -175,7 +175,7 @@ def test_true_model_and_sub_elites_make_the_next_proposal(k, key, x64):
     assert plan.chosen == (40,) * 4 and plan.evaluated == 0
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_points_of_the_searches_are_evaluated_next(key):
     searches, batches = asked(
         "ce_surrogate",
@@ -234,7 +234,7 @@ def test_one_program_is_ask_and_tell(method, schedule, key, x64):
         np.testing.assert_array_equal(a, b)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_the_objective_is_asked_for_exactly_the_budget(key):
     calls = []
     schedule = ce.schedules.geometric(0.3)
@@ -280,7 +280,7 @@ def test_points_may_be_moved_before_they_are_evaluated(key):
     np.testing.assert_array_equal(ce.finish(search).history.x[:6], clipped)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_proposals_and_objectives_share_one_program(key, traced):
     f = ce.sierra()
     ce.ce_surrogate(key, f, (np.zeros(2), 200.0), samples=4, elites=2, iterations=2)
@@ -344,7 +344,7 @@ def test_selection():
     ] == [0, 1, 2, 7, 10]
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_float32_and_float64(key, x64):
     for dtype in (np.float32, np.float64):
         mean, covariance = (a.astype(dtype) for a in START)
@@ -450,7 +450,7 @@ def test_a_budget_of_one(method, mode, key):
     assert all(np.isfinite(a).all() for a in jax.tree.leaves(result.proposal))
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_singular_elites_leave_the_proposal(key):
     # two points of a plane have no covariance
     result = ce.ce_method(key, bowl, START, samples=10, elites=2, iterations=3, mode="thesis")
@@ -462,7 +462,7 @@ def test_singular_elites_leave_the_proposal(key):
     assert all(np.isfinite(a).all() for a in jax.tree.leaves(flat.history.proposals))
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_the_call_that_the_thesis_prints(key, x64):
     """``ce_surrogate(paraboloid, M; basis=:squared)`` finds the bottom: squared distances to
     points span a paraboloid.
@@ -606,7 +606,7 @@ def test_bad_answers_are_named(key):
 # ---- what is printed, and scores
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_result_prints_as_a_table(key):
     result = ce.ce_method(key, bowl, START, samples=4, elites=3, iterations=3)
     lines = str(result).splitlines()
@@ -688,7 +688,7 @@ def test_sierra(method, mode, x64):
             assert s.frobenius[-1] < 16
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_the_plain_method_is_the_published_one(x64):
     for (_, (mean, variance, samples, elites)), (published, slack) in zip(
         CASES.items(), ((-0.0134, 0.001), (-0.0031, 0.0006), (-0.0069, 0.0006)), strict=True

@@ -104,7 +104,7 @@ def test_bad_settings(make, message):
         make()
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("name", mark_long(LEARNING, "mcts", "forest"))
 def test_units_change_nothing(key, name):
     """Exactly for powers of two, which lose no digit; up to rounding for others."""
@@ -214,7 +214,7 @@ def test_scales_of_systems_that_say_little():
     assert found.tally.invalid == found.tally.episodes
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_mode_of_infinite_density_is_not_counted_from(key):
     sim = jast.Simulator(
         lambda x0: jnp.zeros(()),
@@ -231,7 +231,7 @@ def test_a_mode_of_infinite_density_is_not_counted_from(key):
     assert (e.reward[order] == np.sort(e.reward)[::-1]).all()
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("width", [1.0, 2.5])
 def test_wide_draws_and_their_density(key, width):
     wide, keys = actions.wide(width), jax.random.split(key, 4000)

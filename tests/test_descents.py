@@ -192,7 +192,7 @@ def test_the_variance_of_a_chain_is_that_of_all_pairs(key, way, monkeypatch):
         assert run.log_mean == pytest.approx(np.log(means).sum(), rel=1e-12)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("way", ["distance", "width"])
 def test_variances_are_those_of_repeated_populations(key, way):
     """The mean of 60 told variances over the variance of 60 estimates. The latter has a relative
@@ -299,7 +299,7 @@ def latch():
     )
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("way", ["distance", "width"])
 @pytest.mark.parametrize(
     "sim, truth",
@@ -341,7 +341,7 @@ def test_numbers_that_an_episode_did_not_use_are_the_models(key):
     assert len(unused) > 4_000 and abs(unused.var() - 1) < 0.12
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_nothing_but_invalid_episodes_ends_without_an_answer(key):
     sim = limit_state(lambda u: jnp.nan * u[0], 2)
     for way in DESCENTS.values():
@@ -367,7 +367,7 @@ def test_plain_draws_have_the_interval_of_their_counts(key):
     assert found.interval == clopper_pearson(k, n, 0.9)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_few_invalid_episodes_are_counted_and_do_no_harm(key):
     """NaN in 3e-6 of all, .1 % of P: less than the hundredth that matters."""
     sim = limit_state(lambda u: jnp.where(u[1] > 4.5, jnp.nan, 3.0 - jnp.abs(u[0])), 2)
@@ -432,7 +432,7 @@ def test_a_stopped_call_goes_on_from_its_checkpoint(key, tmp_path, equal, monkey
         equal(tuple(one.proposal), tuple(alone.proposal))
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_stress_compiles_few_programs_and_hardly_more_with_a_second_key(key, small):
     """A walk that fails on either side, at any of its last steps; 26 were measured. A key whose
     first look meets a failure compiles two to play it.
@@ -523,7 +523,7 @@ def small(monkeypatch):
     monkeypatch.setattr(stress, "REFINE_EVALUATIONS", 6000)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_stress_where_failures_are_frequent(key, small):
     """P = .16: plain draws, and the likeliest failure at e^-.5."""
     report = jast.stress(key, limit_state(lambda u: 1.0 - u[0], 2), 60_000)
@@ -534,7 +534,7 @@ def test_stress_where_failures_are_frequent(key, small):
     assert [m.share for m in report.modes] == [1.0] and report.episodes <= 60_000
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_stress_of_a_rare_failure(key, small):
     """The half-space at 4: its design point, e^-8, and all of the probability in one mode. The
     plain draws of the first look are among those that guarantee an interval.
@@ -553,7 +553,7 @@ def test_stress_of_a_rare_failure(key, small):
     assert [m.share for m in report.modes] == [1.0]
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_default_stress_is_made_again_where_a_known_budget_would_do(key, small, monkeypatch):
     monkeypatch.setattr(budgets, "measure_budget", lambda *args: 50_000)
     more = lambda found, budget: 60_000 if budget == 50_000 else None
@@ -593,7 +593,7 @@ def counted_box():
     return jast.blackbox.from_python(run, horizon=3, disturbance=D.Normal(0.0, 1.0)), calls
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_stress_goes_on_where_it_was_stopped(key, tmp_path):
     """A second run of the same call asks a black box for the first look alone and what it
     replays.
@@ -609,7 +609,7 @@ def test_stress_goes_on_where_it_was_stopped(key, tmp_path):
     assert str(last) == str(again) == str(whole) and len(calls) < 300
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_refine_goes_on_where_it_was_stopped(key, tmp_path):
     sim, calls = counted_box()
     found = jast.search.monte_carlo(key, sim, episodes=2000, refine=0).failures
@@ -623,7 +623,7 @@ def test_refine_goes_on_where_it_was_stopped(key, tmp_path):
         jast.search.refine(key, sim, found, budget=700, checkpoint=tmp_path)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_stress_is_the_same_wherever_its_populations_run(key, small):
     sim = limit_state(lambda u: 3.5 - jnp.sum(u) / 3**0.5, 3)
     with ThreadPoolExecutor(2) as pool:

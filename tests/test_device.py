@@ -63,7 +63,7 @@ def test_outcomes_do_not_follow_from_the_blocks(accelerated):
     )
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_population_of_one_block_finds_the_probability(accelerated, key):
     """1920 points, of which no other test has as many: 300,000 evaluations have a standard error of
     5 %, and 20 % are four.

@@ -53,7 +53,7 @@ def supported(dtype):
     }
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("name", list(supported("float32")))
 def test_quantile_is_scipys(name, dtype):
     d, truth = supported(dtype)[name]
@@ -67,7 +67,7 @@ def test_quantile_is_scipys(name, dtype):
         )
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_quantiles_of_a_joint(dtype):
     d = D.Joint(
         (
@@ -153,7 +153,7 @@ def points(d, n, low=0.0, high=1.0):
     )
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("name", list(supported_too("float32")))
 def test_cdf_inverts_quantile(name, dtype):
     d = supported_too(dtype)[name]
@@ -185,7 +185,7 @@ def test_cdf_inverts_quantile(name, dtype):
         )
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_cdf_of_arrays_is_elementwise(dtype):
     f = lambda v: jnp.asarray(v, dtype)
     tosses = D.Independent(D.Bernoulli(probs=f([[0.5, 0.2], [0.9, 0.0]])), 2)
@@ -219,7 +219,7 @@ def closed_forms():
     }
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("name", list(supported("float32")))
 def test_cdf_is_scipys(name, dtype):
     d, _ = supported(dtype)[name]
@@ -234,7 +234,7 @@ def test_cdf_is_scipys(name, dtype):
     )
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name", [name for name in supported_too("float32") if name not in ("joint", "tri", "upper")]
 )
@@ -417,7 +417,7 @@ def test_far_out_a_tent_still_has_a_density(dtype):
             assert jnp.isfinite(d.log_prob(x)).all() and jnp.isfinite(d.log_prob_from_mode(x)).all()
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "center, width, low, high",
     [(0.5, 1, 0, 1), (0.0, 1, 0, 1), (1.0, 1, 0, 1), (0.9, 0.3, 0, 1), (2.0, 5, -1, 4)],
@@ -529,7 +529,7 @@ def test_fixed_and_deterministic(key):
 # densities
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("name", list(supported("float32")))
 def test_log_density_is_raw_or_less_that_of_the_mode(name, dtype, key):
     d, _ = supported(dtype)[name]
@@ -602,7 +602,7 @@ def test_quantiles_of_uniform_numbers_are_draws(key):
         assert abs(x.mean() - other.mean()) < 4 * np.sqrt((x.var() + other.var()) / 20_000)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_slopes_of_the_normal_distribution_function_and_of_its_inverse(dtype):
     z = np.linspace(-5, 5, 41).astype(dtype)
     p = scipy.stats.norm.cdf(z).astype(dtype)

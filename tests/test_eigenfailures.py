@@ -75,7 +75,7 @@ def test_what_varies_more_is_a_direction_too():
     assert abs(variances[0] - 9) < 5 * 9 * math.sqrt(2 * (w**2).sum()) and abs(mean[0]) < 0.5
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("source", ["estimate", "samples"])
 def test_failures_of_an_estimate(key, source):
     """Of weighted draws and of equal ones; the replays lie on the line that they are said to."""
@@ -117,7 +117,7 @@ def lane(limit=4.0):
     )
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_each_mode_of_a_report(key, tmp_path):
     """Two modes whose directions are opposite; together they would vary more, and not shift."""
     sim = lane()
@@ -170,7 +170,7 @@ def test_failures_at_any_time_are_one_direction(key):
     assert found.middle.failure and int(found.middle.length) == 6
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_of_an_archive_and_of_choices(key):
     """Copies of one failure, three coins of probability 0.2: each is anywhere among the normal
     numbers that give it, those above 0.84, and the fourth, behind the end, as the model has it.
@@ -197,7 +197,7 @@ def test_of_an_archive_and_of_choices(key):
     assert not few.reliable and str(few).startswith("UNRELIABLE")
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_bad_input(key):
     sim = plane((1.0, 0.0), 1.0)
     safe = jax.vmap(lambda x: jast.replay(sim, x))(jnp.zeros((30, 1, 2)))

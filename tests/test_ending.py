@@ -79,7 +79,7 @@ def test_it_pays_and_leaves_the_search_as_it_was(key, name, equal, tmp_path):
     assert str(again) == str(on) and again.evaluations == on.evaluations
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_reward_of_ones_own_and_what_is_published_have_none(key):
     few = dict(samples=200, elites=40, iterations=6)
     own = dict(reward=rewards.standard(event_bonus=30.0, density="mode"))
@@ -95,7 +95,7 @@ def test_a_reward_of_ones_own_and_what_is_published_have_none(key):
     assert asked.failures.tree[0] == final.REFINED
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_where_it_is_off(key):
     """Few episodes, disturbances without a quantile function, log p of another density, a traced
     search.
@@ -148,7 +148,7 @@ def test_what_was_asked_for_in_vain_is_refused(key):
         jax.jit(lambda key: monte_carlo(key, SIM, episodes=100, refine=0.1).episodes)(key)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_system_on_the_host(key):
     """An invalid run is no failure, and is an incident once, however often it is asked for."""
 
@@ -170,7 +170,7 @@ def test_a_system_on_the_host(key):
         assert bool(jast.replay(sim, e).failure) and e.disturbances[0] <= 1.9
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_an_interruption_leaves_what_was_found(key, monkeypatch):
     def interrupted(*_, **__):
         raise KeyboardInterrupt
@@ -192,7 +192,7 @@ def test_an_interruption_leaves_what_was_found(key, monkeypatch):
     assert "interrupted" in found.settings
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_nothing_found_nothing_refined(key):
     found = monte_carlo(key, linear(10, beta=9.0), episodes=2000)
     assert found.refined is None and found.settings["refine"] == 0.1

@@ -382,7 +382,7 @@ def test_walk_rate(make, truth, key):
     assert found.interval[0] < found.rate < found.interval[1]
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_landing_rate_depends_on_when_it_is_evaluated(key):
     n, at_end = 100_000, float(jast.simulators.landing_probability(b=0.2))
     assert at_end == pytest.approx(0.14679308730757, rel=1e-5)

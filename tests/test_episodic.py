@@ -70,7 +70,7 @@ def since(host):
     return n
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_an_episode_is_evaluated_once_at_its_end(key):
     sim, host = counted()
     jast.check(sim)
@@ -146,7 +146,7 @@ def test_a_random_start_and_an_early_end_are_evaluated_once_too(key):
         np.testing.assert_allclose(e.distance, 3 - total, rtol=1e-5, atol=1e-5)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("limit", [1e9, 1.0, -1.0], ids=["never", "sometimes", "at the start"])
 @pytest.mark.parametrize("search", mark_long(["monte_carlo", "mcts", "forest"], "mcts"))
 def test_one_start_and_an_end(key, search, limit):
@@ -184,7 +184,7 @@ def test_one_start_and_an_end(key, search, limit):
 # ----------------------------------------------------------------------------
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "search", mark_long(["monte_carlo", "cem", "mcts", "forest"], "cem", "mcts")
 )
@@ -227,7 +227,7 @@ def test_trials_are_the_episodes(key, search):
     assert np.corrcoef(t.reward[miss], t.log_prob[miss] - t.distance[miss])[0, 1] > 0.99
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_without_record_there_are_no_trials(key):
     assert jast.search.monte_carlo(key, FERRY, episodes=100).trials is None
 
@@ -302,7 +302,7 @@ def episodes_of(sim, keys, simulations, memoize, **choices):
     )
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("memoize", mark_long(["node", "root", "none"], "root", "none"))
 def test_rebuilt_episodes_are_those_of_the_search_whatever_is_kept(key, memoize):
     sim, keys = needle(), tree_keys(jax.random.key(3), 2)
@@ -317,7 +317,7 @@ def test_rebuilt_episodes_are_those_of_the_search_whatever_is_kept(key, memoize)
     )
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_after_a_failure_its_path_grows_step_by_step():
     """Until the next better one: the episodes after it have one step after the other in common with
     it.
@@ -341,7 +341,7 @@ def test_after_a_failure_its_path_grows_step_by_step():
     assert leads > 10
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_value_head_cannot_follow(key):
     with pytest.raises(ValueError, match="forest: follow must be False with a value head"):
         forest(key, FERRY, trees=2, prunes=1, simulations=5, heads="value", follow=True)
@@ -386,7 +386,7 @@ def test_equation_3_2_as_printed_and_made_monotone(key):
         jast.rewards.episodic(mode="printed")
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_reward_of_whole_episodes_in_a_tree_is_that_of_its_replay(key):
     with pytest.warns(UserWarning):
         printed = jast.rewards.episodic(10.0, mode="thesis")

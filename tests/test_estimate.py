@@ -425,7 +425,7 @@ def test_the_level_is_the_one_that_was_asked_for():
     assert estimate_from_counts("x", some(), level=0.95).level == 0.95
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_coverage_of_the_interval():
     """Log-normal weights of spread .8, 400 of 1000 episodes failing: of 2000 intervals at .9 the
     share that covers is .9 within 4 standard errors and .01.

@@ -44,7 +44,7 @@ def planted(steps, length=50):
     return sums(weights, 6.0)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_minimal_finds_the_planted_steps(key):
     steps = [6, 7, 30]
     sim = planted(steps)
@@ -68,7 +68,7 @@ def test_minimal_spares_what_another_order_needs():
     assert np.flatnonzero(m.needed).tolist() == [8]
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_minimal_of_choices():
     sim = slips()
     x = jnp.array([0, 2, 0, 2, 1, 1, 1], jnp.int32)
@@ -116,7 +116,7 @@ def test_criticality_of_a_walk(key):
     assert c.evaluations >= 6 * 2000 and "raised it most" in str(c)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["shapley", "integrated", "gradient"])
 def test_attribution_of_a_sum(method):
     """A linear system: every number has its own share, whatever the method."""
@@ -167,7 +167,7 @@ def walk(below):
     return line(evaluate=evaluate, horizon=2, episodic=True)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_regression_is_where_the_new_version_alone_fails():
     both = explain.regression(walk(None), walk(4.0))
     for x, expected in (([-2.0, -2.5], True), ([3.0, 2.5], False), ([0.0, 1.0], False)):
@@ -192,7 +192,7 @@ def test_the_likeliest_regression_and_its_probability(key):
         assert not bool(jast.replay(walk(None), e.disturbances).failure)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_sensitivity_of_the_landing(key):
     """The derivatives of 2 Phi(-b / sqrt(si^2 + 10 st^2)) to both, within 4 standard errors."""
     sim = jast.simulators.landing()
@@ -211,7 +211,7 @@ def test_sensitivity_of_the_landing(key):
     assert "elasticity" in str(found)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_sensitivity_of_a_long_system(key):
     """Thirty steps are drawn by tilts: of a sum of normals P = Phi(-limit / (s sqrt(30))), so that
     d log P / d s is hazard * beta / s. Within 4 standard errors.
@@ -231,7 +231,7 @@ def test_sensitivity_of_a_long_system(key):
     assert abs(slope - hazard * beta) < 4 * error and error < 0.05 * slope
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_bad_input(key):
     sim = sums(np.ones(3), 4.0)
     failing = jast.replay(sim, jnp.full(3, 2.0))
@@ -282,7 +282,7 @@ def test_cards_of_modes(key):
     assert explain.cards(key, sim, []) == []
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_failure_at_the_edge_is_explained(key):
     """The way to normal numbers and back may round it to the other side."""
     law = Uniform(0.0, 1.0)

@@ -58,7 +58,7 @@ def found():
     return explain.rules(SIM, drawn(0, 12, SIM, gust=2.0, delay=1.0), episodes=400)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_the_planted_rule_in_the_words_of_the_user(found):
     (rule,) = found.rules
     bounds = {what: (low, high) for what, _, low, high in rule.conditions}
@@ -74,7 +74,7 @@ def test_the_planted_rule_in_the_words_of_the_user(found):
     assert found.evaluations > 10 * 400 and found.settings["method"] == "rules"
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_rule_is_right_about_fresh_episodes(found):
     bad, calm = drawn(1, 400, SIM, gust=2.0, delay=1.0), drawn(2, 400, SIM)
     said = found.predict(bad)
@@ -169,7 +169,7 @@ def test_groups_are_held_out_as_a_whole():
     assert 0 < hold_out(rng, owner, group, 0.3).mean() < 0.35
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_an_early_end_tells_nothing():
     """The system fails at the first great gust and ends there; others go on. Neither the length nor
     what is behind the end may serve as a rule.
@@ -190,7 +190,7 @@ def test_an_early_end_tells_nothing():
         assert r.precision["fails"] > 0.95 and r.recall["fails"] > 0.95
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_rules_of_choices():
     """Three slips in a row."""
     sim = slips()
@@ -202,7 +202,7 @@ def test_rules_of_choices():
     assert r.recall["fails"] > 0.8
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_start_and_states_have_their_names():
     sim = late_gust(
         start=lambda: Joint(dict(load=Uniform(0.0, 1.0))),
@@ -218,7 +218,7 @@ def test_a_start_and_states_have_their_names():
     assert r.predict(bad).shape == bad.length.shape
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_one_failure_and_float64(x64):
     """Variants of a single failure are enough."""
     sim = late_gust()
@@ -245,7 +245,7 @@ def test_a_black_box_is_called_as_often_as_is_said():
     assert "x at step 2 > " in str(r) and len(calls) <= r.evaluations + 10
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_bad_rules():
     bad, calm = drawn(0, 6, SIM, gust=2.0, delay=1.0), drawn(1, 20, SIM)
     with pytest.raises(ValueError, match="rules: failures must all fail"):
@@ -294,7 +294,7 @@ def walked():
     return sim, bad, jax.tree.map(lambda a: a[:400], calm)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("model", ["boosted", "logistic"])
 def test_a_monitor_warns_before_a_walk_fails(walked, model):
     sim, bad, calm = walked
@@ -315,7 +315,7 @@ def test_a_monitor_warns_before_a_walk_fails(walked, model):
     assert "area under the ROC curve" in str(m) and m.evaluations == len(bad.length) + 400
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_monitor_of_what_the_user_observes(walked):
     """Simulated near misses and ordinary episodes, and an observation of the user's own."""
     sim, bad, _ = walked

@@ -48,7 +48,7 @@ def test_the_books_turn(x64):
     np.testing.assert_allclose(found[5], 0.3, atol=1e-6)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_the_books_level_flight(x64):
     """Table 3.6-2: throttle, alpha and elevator by speed, to its digits; 502 ft/s of 3.6-3."""
     book = np.array([[170, 0.464, 27.2, 0.621], [200, 0.287, 19.7, 0.723],
@@ -63,7 +63,7 @@ def test_the_books_level_flight(x64):
     np.testing.assert_allclose(controls.elevator, book[:, 3], atol=6e-4)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_the_gains_are_what_the_design_says():
     design = f16_design.design()
     np.testing.assert_allclose(gcas.PITCH, design.pitch, rtol=1e-5, atol=1e-3)
@@ -98,7 +98,7 @@ def test_flights_are_exact_enough():
     assert least == pytest.approx(47.65, abs=0.5)  # as of this design; published gains differ
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_flights_are_episodes(key):
     """In the worst corner, from an altitude that hits the ground and from one that does not; yaw
     changes nothing.
@@ -114,7 +114,7 @@ def test_flights_are_episodes(key):
     assert whole == pytest.approx(47.65, abs=0.5)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_falsify_needs_no_disturbances():
     found = jast.search.falsify(jax.random.key(1), avoidance(), simulations=60)
     assert found.first_failure is not None
@@ -156,7 +156,7 @@ def test_errors(call, said):
         call()
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_equal_settings_compile_once():
     @jax.jit
     def traced(sim):

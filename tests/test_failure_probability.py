@@ -119,14 +119,14 @@ def test_one_mode(key, gradients):
     check_estimate(found, norm.sf(5), budget=BUDGET)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_black_box_finds_both(key):
     found = failure_probability(key, planes(4.0, 4.0), BUDGET, gradients=False)
     check_estimate(found, 2 * norm.sf(4), budget=BUDGET)
     assert abs(found.modes[0] - 0.5) < 0.1
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("up", mark_long([-1.0, 0.0, 1.0], -1.0, 1.0))
 def test_where_failures_are_common(key, up):
     """P = .84, .5 and .16: not worse than counting the same number of episodes."""
@@ -136,7 +136,7 @@ def test_where_failures_are_common(key, up):
     assert found.relative_error < 1.1 * np.sqrt((1 - truth) / truth / found.samples)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_the_draws_of_the_model_guarantee_an_interval(key):
     """P = 1.35e-3, beside a proposal: the first batch and a tenth or more of the last draws; a flag
     puts them before the estimate.
@@ -154,7 +154,7 @@ def test_the_draws_of_the_model_guarantee_an_interval(key):
     assert lines[2].startswith("probability    between ") and lines[3].startswith("doubtful ")
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_plain_draws_where_no_proposal_serves(key, monkeypatch):
     """Then subset simulation answers, flagged, and its guarantee is the first batch's."""
     monkeypatch.setattr(by_proposal.Search, "suffices", property(lambda s: False))
@@ -165,7 +165,7 @@ def test_plain_draws_where_no_proposal_serves(key, monkeypatch):
     assert lines[i + 1].startswith("doubtful ") and lines[0].startswith("UNRELIABLE: ")
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_walk_that_often_fails(key):
     """At any step, on either side, so that episodes use one to four numbers: P = .068, by
     quadrature.
@@ -195,7 +195,7 @@ def test_invalid_episodes(key):
     assert 0 < invalid / n < found.guaranteed[1]  # all of them may have failed
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_below_the_least_double(key):
     """2 Phi(-60), a number of 783 digits behind the point: as a logarithm, within 4 standard errors
     of scipy's.
@@ -234,7 +234,7 @@ def test_the_least_budget_is_kept(key):
     assert abs(found.log_mean - norm.logsf(3)) < 4 * found.relative_error, found.history
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_interrupts_keep_whole_chunks(two):
     seen = []
 
@@ -311,7 +311,7 @@ def test_subset_simulation(key):
         subset_simulation(key, planes(4.0), SIZE, replicates=2)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_adaptive_cross_entropy(key):
     found = adaptive_cross_entropy(key, planes(3.5), BUDGET)
     check_estimate(found, norm.sf(3.5), budget=BUDGET)
@@ -674,7 +674,7 @@ def test_samples_of_landing(key, proposal, moves):
         assert 0.1 < found.accepted < 0.9 and len(np.unique(e.x0)) > found.distinct
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_samples_of_an_estimate(key, two):
     """Both modes by their shares; on the failing side of the planes; nearest ones likeliest."""
     sim, truth, estimate = two
@@ -725,7 +725,7 @@ def hidden(share):
     )
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_defect_that_no_distance_knows_of_is_not_silent(key):
     """P = 2e-3 beside 3.4e-6: a twentieth of the budget meets it five times."""
     found = failure_probability(key, hidden(2e-3), BUDGET)
@@ -733,7 +733,7 @@ def test_a_defect_that_no_distance_knows_of_is_not_silent(key):
     assert not found.reliable or abs(found.log_mean - np.log(truth)) < 4 * found.relative_error
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_what_nothing_led_to_has_a_bound(key):
     """A batch of the search and at least a tenth of the last draws are the model's own."""
     found = failure_probability(key, planes(5.0), BUDGET)
@@ -743,7 +743,7 @@ def test_what_nothing_led_to_has_a_bound(key):
     assert found.modes.sum() == pytest.approx(1)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_proposal_that_lost_failures_is_given_up(key, monkeypatch):
     """Then plain draws answer where they see enough failures, and else subset simulation, which is
     not believed.
@@ -767,7 +767,7 @@ def _along(beta, x):
     return beta - x.sum() / jnp.sqrt(jnp.asarray(x.shape[0], x.dtype))
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_another_budget_and_parameter_compile_nothing(key):
     """Also where tilts are tried after the Gaussians, as with the least budget here."""
     plane = lambda beta: limit_state(Partial(_along, jnp.asarray(beta, jnp.zeros(()).dtype)), 20)

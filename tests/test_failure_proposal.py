@@ -99,7 +99,7 @@ def test_unequal_sides(key):
     assert (error < 0.1 * near).all()
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_random_start_is_tilted(key):
     """Landing at b = .6, two equal modes: the estimate is between one mode's probability,
     Phi(-4.353), and that of both, within 4 standard errors.
@@ -140,7 +140,7 @@ def shapes(dtype):
     }
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("precision", ["float32", "float64"])
 @pytest.mark.parametrize("name", ["tent", "uniform", "laplace", "normal", "either"])
 def test_tilted_density(key, name, precision):
@@ -182,7 +182,7 @@ def test_tilted_generic_agrees_with_the_shifted_normal():
     )
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_tilted_vectors_and_structures(key):
     """Log densities are sums over the parts, and draws have the moments."""
     m, s = jnp.array([1.0, -1.0]), jnp.array([0.5, 2.0])
@@ -273,7 +273,7 @@ def test_failures_with_a_distance(key):
     assert found.failing[-1] > 100
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_jit_vmap_and_text(key):
     sims = jax.vmap(hyperplane)(jnp.array([2.0, 3.0]))
     many = jax.vmap(lambda sim: failure_proposal(key, sim, **SMALL))(sims)
@@ -304,7 +304,7 @@ def test_bad_settings(key, settings, message):
         failure_proposal(key, walk(), **settings)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_bad_disturbances(key):
     angle = D.VonMises(jnp.asarray(2.0), jnp.asarray(3.0))
     for dist, name in ((D.seeds(), "Seeds"), (angle, "VonMises")):

@@ -418,7 +418,7 @@ def test_damaged_files_are_refused_or_harmless(tmp_path, archive, seed):
             F.load(path)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_failures_as_plain_numbers(tmp_path):
     """A stranger's program gets the same failure from the table: ten lines of plain Python."""
     sim = jast.Simulator(
@@ -452,7 +452,7 @@ def test_failures_as_plain_numbers(tmp_path):
     assert float(rows[1]["x.pull"]) == float(found[2].disturbances["pull"][0])
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_the_example_of_a_table_runs(tmp_path, monkeypatch, key, capsys):
     """What the docstring shows, with a walk of our own."""
     import textwrap

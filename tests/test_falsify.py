@@ -25,7 +25,7 @@ def held(horizon=12, **changes):
     return above(0.9, horizon, **given | changes)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_what_must_be_held_is_found_with_few_simulations(key):
     """Of 2000 draws of the model none fails."""
     sim = held()
@@ -47,7 +47,7 @@ def test_the_same_key_gives_the_same_search(key, equal):
     assert np.all(np.diff(one.history.best_reward[:, 0]) >= 0)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_it_climbs_where_no_draw_fails(key):
     """The level must stay in a narrow band: no corner fails."""
     band = predicate(lambda s: 0.05 - jnp.abs(s - 0.6), "s in the band")

@@ -78,7 +78,7 @@ def mapped(function, values):
     return np.asarray(jax.jit(jax.vmap(function))(values))
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name", mark_long(floats("float32"), "half", "gamma below 1", "beta below 1", "cauchy")
 )
@@ -100,7 +100,7 @@ def test_floats_are_scipys_in_both_tails(name, x64, key):
     assert abs(below - 0.3) < 4 * np.sqrt(0.21 / 4000) and D.has_exact_tails(d)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("name", mark_long(floats("float32"), "gamma below 1", "beta below 1"))
 def test_floats_rise_in_float32(name):
     d, scipys = floats("float32")[name]
@@ -114,7 +114,7 @@ def test_floats_rise_in_float32(name):
     np.testing.assert_allclose(x[far], truth(scipys, z)[far], rtol=1e-3, atol=1e-5)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("name", mark_long(counts("float32"), "poisson", "binomial"))
 def test_counts_are_scipys_in_both_tails(name, x64, key):
     d, scipys = counts("float64")[name]
@@ -176,7 +176,7 @@ def test_derivatives_are_those_of_the_inverse(x64):
         np.testing.assert_allclose(slope, (ends[0] - ends[1]) / 2e-5, rtol=1e-5)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_the_logs_of_the_tails_invert(dtype):
     z = jnp.linspace(-12, 12, 241, dtype=dtype)
     below, above = log_tails(z)

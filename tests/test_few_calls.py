@@ -81,7 +81,7 @@ def test_points_of_the_pool_weigh_as_the_model_does(coarse):
     assert abs(w.mean() - norm.sf(1.5)) < 4 * error < 0.2 * norm.sf(1.5)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_fifty_calls_find_a_hyperplane_in_ten_dimensions(dtype, coarse):
     sim = limit_state(Partial(_plane, jnp.asarray(4.5)), 10)
     r = failure_probability(jax.random.key(0), sim, 50)
@@ -96,7 +96,7 @@ def test_fifty_calls_find_a_hyperplane_in_ten_dimensions(dtype, coarse):
     assert r.unseen == pytest.approx(-np.log(0.05) / 6) and "unseen" in str(r)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_key_gives_one_answer_and_another_budget_spends_all(coarse):
     sim = limit_state(Partial(_plane, jnp.asarray(3.0)), 2)
     a, b = (failure_probability(jax.random.key(0), sim, 53) for _ in range(2))
@@ -105,7 +105,7 @@ def test_a_key_gives_one_answer_and_another_budget_spends_all(coarse):
     assert a.evaluations == 53
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_black_box_with_workers_is_called_as_often_as_said(coarse):
     noise = MultivariateNormalDiag(jnp.zeros(2), jnp.ones(2))
     sim = jast.blackbox.from_python(branches, horizon=1, disturbance=noise, workers=2)
@@ -141,7 +141,7 @@ def test_invalid_episodes_are_counted_and_teach_nothing(coarse):
     assert not r.reliable or abs(r.mean / truth - 1) < 4 * r.relative_error
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_known_failures_join_what_is_learned_and_cost_no_call(coarse):
     sim = limit_state(Partial(_plane, jnp.asarray(3.0)), 2)
     known = np.array([[2.2, 2.2], [2.5, 1.9]])

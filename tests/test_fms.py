@@ -177,7 +177,7 @@ HAND_MADE = [
 ]
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_packets_and_events_are_those_of_the_second_implementation():
     build = dict(eps=0.03, bank=23.3, tas=450.0)
     near = routes(6, 3, np.array([180.0, 1, -88.5, 66.8]), np.array([45.0, 3, 39.5, 24.4]))
@@ -202,7 +202,7 @@ def test_packets_and_events_are_those_of_the_second_implementation():
     assert 10 <= fails < len(xs)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "x, settings, fails",
     [
@@ -270,7 +270,7 @@ def test_rate_and_miss_distances():
     assert abs(ball.arc_length[count:][sound].mean() - fixed.arc_length[count:][sound].mean()) < 0.5
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_rate_of_short_legs():
     n = 5 * CHUNK
     # the thesis's first proposal of the cross-entropy method
@@ -290,7 +290,7 @@ def test_undisturbed():
     )  # four normals: 2 below the mode, on average
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_database():
     sim = fms(database=True)
 
@@ -316,7 +316,7 @@ def test_database():
 # odd routes
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_unfinished_routes_and_empty_states():
     sim = fms()
     zero = jax.tree.map(jnp.zeros_like, sim.init(()))
@@ -348,7 +348,7 @@ WIND = st.one_of(st.just(0.0), st.floats(-500, 500))
 ROUTE = st.lists(st.tuples(COURSE, LENGTH, COURSE, WIND), min_size=12, max_size=12)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @settings(
     max_examples=120, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
 )

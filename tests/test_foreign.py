@@ -30,7 +30,7 @@ FROZEN = {
 }
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("name", OF_SCIPY)
 def test_a_frozen_distribution_is_of_the_same_law(name):
     """Densities, and quantiles at z from -4 to 4, against scipy's own."""
@@ -130,7 +130,7 @@ def numpyros():
     }
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [*OF_NUMPYRO, "Cauchy", "HalfNormal", "VonMises", "Independent"])
 def test_numpyros_are_of_the_same_law(name, key):
     with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
@@ -150,7 +150,7 @@ def test_numpyros_are_of_the_same_law(name, key):
                 assert float(D.cdf(d, x)) == pytest.approx(u, rel=1e-4)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_system_with_numpyros(key):
     """The probability of jast's normal distribution; and of a family that jast does not have."""
     n = pytest.importorskip("numpyro.distributions")

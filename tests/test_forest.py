@@ -107,14 +107,14 @@ def test_every_archived_failure_replays_to_the_bit():
         replays(archive.episode(i), RING, BONUS)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_every_episode_is_counted_once():
     result = once("ferry")
     assert result.episodes == EPISODES  # no root of S0 comes to an end so early
     assert result.roots.valid.all() and (result.roots.visits[0].sum(1) == 60).all()
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_the_archive_holds_the_best():
     three, many = once("landing", top=3), once("landing")
     assert three.failures.size == 3 and three.failures.seen == many.failures.seen > 64
@@ -122,7 +122,7 @@ def test_the_archive_holds_the_best():
     np.testing.assert_array_equal(three.failures.episodes.x0, many.failures.episodes.x0[:3])
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_the_first_failure_is_counted_in_the_order_of_simulation():
     result = once("landing")
     n = -(-result.first_failure // 6)  # the trees take turns
@@ -166,7 +166,7 @@ def test_a_result_is_readable():
     assert "more episodes;\n  the default reward, which ranks any failure above" in none
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_random_starts_are_found():
     """x0 is chosen by the tree: it differs between failures, and the first root's children are
     starts.
@@ -223,7 +223,7 @@ def test_all_actions_search_all_systems(name, actions):
         assert result.failures.size > 0
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_prunes_beyond_the_horizon_are_left_out():
     result = searched("limit_state")
     assert result.settings["prunes"] == 1 and result.episodes == 6 * 60
@@ -233,7 +233,7 @@ def _breaking(s, x):
     return s + jnp.where(s > 1.0, jnp.nan, x)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_simulator_that_returns_nan_is_counted_and_never_best():
     sim = walk(step=_breaking)
     result = forest(jax.random.key(0), sim, **SIZE, reward=BONUS, actions=ACTIONS["samples"])
@@ -243,7 +243,7 @@ def test_a_simulator_that_returns_nan_is_counted_and_never_best():
     honest(result, sim, BONUS)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_simulator_that_returns_only_nan():
     sim = walk(step=lambda s, x: s * jnp.nan)
     result = forest(jax.random.key(0), sim, **SIZE, reward=BONUS, actions=ACTIONS["samples"])
@@ -293,7 +293,7 @@ def test_a_system_that_always_fails_at_its_first_step():
     honest(result, sim, BONUS)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_trees_that_end_early_end_apart():
     """A tree whose root is an episode's end stops; the others go on, also those of other groups."""
     sim = walk(fails=lambda s: s > 2.0)
@@ -316,7 +316,7 @@ def test_trees_that_end_early_end_apart():
 # ----------------------------------------------------------------------------
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_an_interrupted_search_says_so():
     def stop(done, total, _):
         assert 0 < done <= total == 12 * 18 * 400
@@ -339,7 +339,7 @@ def test_an_interrupted_search_says_so():
     json.dumps(result.settings)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_an_error_of_the_callback_ends_the_search_at_once():
     def fail(done, total, _):
         raise RuntimeError("enough")
@@ -360,7 +360,7 @@ def test_an_error_of_the_callback_ends_the_search_at_once():
     assert time.perf_counter() - began < 60  # all of it would take minutes
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_the_callback_is_told_of_every_simulation():
     told = []
     searched("ferry", callback=lambda done, total, _: told.append((done, total)))
@@ -435,7 +435,7 @@ def best_of(key, adversary, exploration):
     ).best_reward_per_tree
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_traced_search_is_the_same_search():
     traced = best_of(jax.random.key(3), jnp.array([16.0, 0.0]), 10.0)
     np.testing.assert_allclose(traced, once("ferry").best_reward_per_tree, rtol=1e-4)

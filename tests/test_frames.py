@@ -30,7 +30,7 @@ def found():
     )
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_failures_row_by_row(found):
     pytest.importorskip("pandas")
     table = found.failures.to_dataframe()
@@ -41,7 +41,7 @@ def test_failures_row_by_row(found):
     assert table["counts"].tolist() == found.failures.counts.tolist()
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_failures_step_by_step_are_what_the_file_has(found, tmp_path):
     pandas = pytest.importorskip("pandas")
     table = found.failures.to_dataframe(steps=True)
@@ -59,7 +59,7 @@ def test_failures_step_by_step_are_what_the_file_has(found, tmp_path):
     pandas.testing.assert_frame_equal(read, table, check_exact=True)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_modes_trials_and_sweeps(found):
     pytest.importorskip("pandas")
     ways = jast.search.modes(
@@ -128,7 +128,7 @@ def test_what_has_more_axes_is_refused(found):
         e.to_xarray()
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_arviz_reads_samples_of_failures(key):
     """Its mean of the sum of a walk that fails above 3.5 of its standard deviations is that of a
     truncated normal number; its effective size sees that copies which never move are neighbours.

@@ -80,7 +80,7 @@ def test_the_same_key_gives_the_same_report(key):
     assert float(one.failures.best.reward) == pytest.approx(-4, abs=0.05)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_failing_plain_draw_is_kept(key):
     """Nothing tells how near a failure is: of 40 draws one or two fail (.04 each)."""
     sim = walk(evaluate=lambda s: (s >= 2.5, jnp.ones(())), step=lambda s, x: s + x)
@@ -102,7 +102,7 @@ def test_slow_steps_cross_from_basin_to_basin(key):
     assert float(report.failures.best.reward) > -8
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_system_that_never_fails_has_an_upper_bound(key):
     sim = walk(evaluate=lambda s: (jnp.zeros((), bool), jnp.abs(s) + 1))
     report = jast.stress(key, sim, 1000)
@@ -116,7 +116,7 @@ def test_a_system_that_never_fails_has_an_upper_bound(key):
     assert f"\nprobability  {words}\n" in str(report) and "doubtful" not in str(report)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_system_that_fails_undisturbed_is_told_so(key):
     sim = walk(init=lambda x0: jnp.full((), 5.0), step=lambda s, x: s + 0 * x)
     with warnings.catch_warnings():
@@ -142,7 +142,7 @@ def test_a_system_whose_start_alone_is_random(key):
     assert abs(p.mean - truth) < 4 * p.relative_error * p.mean
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_seeds_of_unknown_density_make_one_mode(key):
     sim = walk(
         disturbance=lambda s: seeds(),
@@ -154,7 +154,7 @@ def test_seeds_of_unknown_density_make_one_mode(key):
     assert report.probability.mean == pytest.approx(math.erfc(1) / 2, rel=0.5)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("limit", [6.0, 10.0])
 def test_a_black_box_takes_the_same_call(key, limit):
     """300 calls in all tell the likeliest failure, log p = -limit^2 / 8, and how likely failure is,
@@ -178,7 +178,7 @@ def test_a_black_box_takes_the_same_call(key, limit):
     assert abs(math.log(p.mean / truth)) < 2 * max(low, high)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_bad_input_and_interrupts(key):
     with pytest.raises(ValueError, match="stress: budget"):
         jast.stress(key, walk(), 299)

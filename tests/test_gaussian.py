@@ -148,7 +148,7 @@ def test_samples_have_the_moments(dtype, key):
     assert scipy.stats.kstest(r2, scipy.stats.chi2(3).cdf).pvalue > 1e-3
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_under_jit_and_vmap(dtype, key):
     def all_of_it(key, w):
         x = sample(key, three(dtype), 20)
@@ -243,7 +243,7 @@ def test_the_old_one_stays_where_there_is_no_new_one(x, w, dtype):
     assert same(FIT(old, jnp.asarray(x, dtype), jnp.asarray(w, dtype)), old)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @settings(max_examples=100, deadline=None)
 @given(
     seed=st.integers(0, 2**32 - 1),

@@ -38,7 +38,7 @@ def sklearn_process(kernel, x, y, lengthscale, noise, variance):
     ).fit(x, y)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("kernel", KERNELS)
 def test_posterior_and_likelihood_are_those_of_scikit_learn(kernel, x64):
     x, y = data(25, 3)
@@ -152,7 +152,7 @@ def test_it_vmaps():
         np.testing.assert_allclose(both[i], one, rtol=2e-2, atol=2e-2)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "kind, detail",
     [
@@ -196,7 +196,7 @@ def test_least_squares_are_those_of_numpy(kind, detail, x64):
     )
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_polynomial_finds_a_paraboloid(x64):
     x = jnp.asarray(data(30, 3)[0])
     f = lambda x: (x[:, 0] - 1) ** 2 + x[:, 1] * x[:, 2] + 3
@@ -283,7 +283,7 @@ def test_a_frame_of_few_points_is_sound(rows):
     assert np.isfinite(f.factor).all() and (np.diagonal(f.factor) > 0).all()
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", surrogates.SURROGATES)
 @pytest.mark.parametrize("n", [0, 1, 3])
 def test_surrogates_of_few_points_are_finite(kind, n):

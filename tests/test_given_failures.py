@@ -68,7 +68,7 @@ def archive(sim, *rows):
 
 
 # with no goal in reach the search meets no failure, and begins with what is given
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("goal", [14, 1000])
 def test_a_mode_that_the_search_loses_is_found_with_a_failure_of_it(key, goal):
     sim = relay(goal)
@@ -82,7 +82,7 @@ def test_a_mode_that_the_search_loses_is_found_with_a_failure_of_it(key, goal):
         check_estimate(without, leads(goal))
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_failures_given_lead_and_are_not_counted(key):
     """What the tilts cover changes nothing but the number of draws, however often it is given."""
     sim = ruin(goal=15, horizon=60)

@@ -124,7 +124,7 @@ def test_cells_of_the_user(key):
         go_explore(key, sim, cell=lambda state: ())
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_nan_is_counted_and_never_best(key):
     sim = climb()
     broken = jast.Simulator(

@@ -53,7 +53,7 @@ def layers(head):
     return [(layer["kernel"], layer["bias"]) for _, layer in sorted(of.items())]
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("outputs", [(), (2, 7)])
 @pytest.mark.parametrize("first_activation", [True, False])
 @pytest.mark.parametrize("activation", ACTIVATIONS)
@@ -343,7 +343,7 @@ def test_samples_of_edges():
             np.testing.assert_array_equal(a, [b[i, tree] for tree, i in taught])
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize(("sim", "n", "d"), [(PLANE, 2, 2), (ring(), 5, 3)], ids=["plane", "ring"])
 def test_samples_of_episodes(sim, n, d):
     """At each state of the good ones, the cell of what came next."""
@@ -701,7 +701,7 @@ def test_forests_of_all_kinds_learn(name, heads, actions):
     assert result.heads.levels == SYSTEMS[name].horizon + 1
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_fields_are_as_documented():
     result = once()
     assert isinstance(result.heads, Heads)
@@ -722,7 +722,7 @@ def test_fields_are_as_documented():
     )
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_moments_are_those_of_all_children_of_all_roots():
     """Also the numbers of samples that the lessons tell of."""
     result = once()

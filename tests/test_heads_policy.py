@@ -61,7 +61,7 @@ def test_the_density_on_quantiles_integrates_to_one():
     assert float(jnp.sum(jnp.exp(log_p)) * cell) == pytest.approx(1, abs=6 * 0.5 * 12 / n)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "choose", [actions.samples(), actions.quantiles(), actions.uniform(-4.0, 4.0)]
 )

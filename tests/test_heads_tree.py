@@ -230,13 +230,13 @@ def test_builds_the_tree_of_an_independent_search_with_a_value_head(
     agree(key, EXACT, *widening, candidates, weights, share=0.0, focus=DRAWN[candidates])
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("candidates", mark_long(CANDIDATES, "all"))
 def test_builds_the_tree_of_an_independent_search_with_both_heads(candidates, key, x64):
     agree(key, EXACT, 2.0, 0.5, candidates, (0.6, 0.4), focus=DRAWN[candidates], within=1e-3)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_rolls_out_as_an_independent_search_at_the_first_levels_of_the_share_of_the_policy_head(
     key, x64
 ):
@@ -288,7 +288,7 @@ def built(name, candidates, memoize="node", lanes=3):
     )
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "candidates"), FERRY_ONE)
 def test_counts_of_every_node_add_up(name, candidates):
     tree, root_visits, _ = built(name, candidates)
@@ -317,7 +317,7 @@ def edges_there(problem, tree, lane, places):
     return [np.asarray(a) for a in each]
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "candidates"), FERRY_ONE)
 def test_every_child_has_the_value_of_its_head(name, candidates):
     """Visited or waiting: those to be had, and with "one" the next after the last that was tried.
@@ -415,7 +415,7 @@ def pages_used(candidates, widening, exploration, gain):
     return np.asarray(tree.pages), T.pages_of(p, ROOM), T._pages(ROOM)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("candidates", CANDIDATES)
 @pytest.mark.parametrize("widening", [(0.5, 0.6), (2.0, 0.5), (1.0, 1.0), (8.0, 0.3), (20.0, 0.0)])
 def test_pages_never_run_out(widening, candidates):
@@ -425,7 +425,7 @@ def test_pages_never_run_out(widening, candidates):
         assert (used <= there).all()
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @given(
     k=st.floats(0.05, 30.0),
     alpha=st.floats(0.0, 1.0),
@@ -612,7 +612,7 @@ def best_of(adversary, heads, candidates):
 NEAR = jnp.array([16.0, 0.0])
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_traced_search_is_the_same_search():
     np.testing.assert_allclose(
         best_of(NEAR, KNOWN["ferry"], "one"), once("ferry").best_reward_per_tree, rtol=1e-4
@@ -631,7 +631,7 @@ def test_vmap_over_heads_is_a_loop():
     assert (together[0] != together[1]).any() and (together[0] != together[2]).any()
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_simulator_of_a_kind_and_heads_of_a_kind_do_not_recompile(traced):
     once("ferry")
     traced.clear()

@@ -100,7 +100,7 @@ def within(found, truth, times=4):
 # Densities, against NumPy
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("epsilon", [0.05, 0.6])
 def test_weights_of_several_traces(key, epsilon):
     """Algorithm 1 in each component, p / (eps p + (1 - eps) p(x - x*)) a step, start included, and
@@ -246,7 +246,7 @@ def test_two_traces(key):
     assert found.standard_error == pytest.approx(found.mean * found.relative_error)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("exponent", [-30, -100])
 def test_any_range(key, exponent):
     """Probabilities of 1e-30 and 1e-100, whatever the precision of the suite: within 3 standard
@@ -272,7 +272,7 @@ def test_a_lost_mode_is_half(key):
     assert within(found, MU / 2, 3) and found.reliable
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_policy_with_a_tilted_start(key):
     """1e5 episodes, standard error at most 1 %."""
     found = importance(key, SIM, policy_proposal(SIM, STEER))
@@ -384,7 +384,7 @@ def odd(cut=np.inf, value=0.0, most=np.inf):
     )
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_all_of_the_model_is_plain(key):
     """epsilon = 1, or a policy that is the model: every weight is 1; standard error and effective
     sample size are the binomial ones.
@@ -401,7 +401,7 @@ def test_all_of_the_model_is_plain(key):
     assert found.k_hat == -np.inf
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_proposal_that_does_not_cover(key):
     """Steps above 2.2 cannot be drawn: flagged, though the weights look fine."""
     found = importance(key, WALK, odd(2.2, -np.inf, 2.2), 10 * MORE)
@@ -411,7 +411,7 @@ def test_a_proposal_that_does_not_cover(key):
     assert found.failing > 100
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_weights_that_are_nan(key):
     """They count for nothing, and the estimate is not to be believed; neither are infinite ones."""
     for value in (np.nan, -np.inf):
@@ -423,7 +423,7 @@ def test_weights_that_are_nan(key):
         assert np.isfinite(found.log_mean)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_invalid_episodes(key):
     """A step of more than 3.2 gives NaN: no failure then, as in NumPy (400,000 episodes) within 4
     of both standard errors; counted, and said.

@@ -15,14 +15,14 @@ def printed(code):
     return subprocess.run(command, check=True, capture_output=True, text=True).stdout
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_jast_and_its_rooms_load_nothing_heavy():
     assert printed(f"import jast; {LOADED}").strip() == "[]"
     rooms = "import jast; [getattr(jast, name) for name in jast.__all__]"
     assert printed(f"{rooms}; {LOADED}").strip() == "[]"
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_the_main_job_loads_neither_distrax_nor_what_is_below_it():
     """A search and an estimate on a simulator of the package; intervals need scipy."""
     job = (
@@ -33,14 +33,14 @@ def test_the_main_job_loads_neither_distrax_nor_what_is_below_it():
     assert printed(f"{job}{LOADED}").splitlines()[-1] == "['scipy']"
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_the_command_line_loads_nothing_heavy():
     code = "import runpy, sys; sys.argv = ['jast', '--help']\n"
     code += "try: runpy.run_module('jast', run_name='__main__')\nexcept SystemExit: pass\n"
     assert printed(code + LOADED).splitlines()[-1] == "[]"
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_distrax_is_reached_by_its_names():
     code = "from jast import distributions as D; import sys; print('distrax' in sys.modules);"
     code += (
@@ -49,7 +49,7 @@ def test_distrax_is_reached_by_its_names():
     assert printed(code).split() == ["False", "distrax._src.distributions.von_mises", "True"]
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_user_of_distrax_may_put_distributions_of_jast_into_its_containers():
     printed(
         "import jax, jax.numpy as jnp; from jast.distributions import Normal; import distrax;"
@@ -68,7 +68,7 @@ def test_a_simulator_and_its_distributions_load_no_pallas():
     assert printed(f"{first}; print('jax._src.pallas' in sys.modules)").strip() == "False"
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_no_room_starts_a_device():
     """Settings of JAX hold only from before: `jax.config.update` after the imports is usual."""
     rooms = "import jast; [getattr(jast, name) for name in jast.__all__]"

@@ -36,7 +36,7 @@ def truth(a, beta):
     return p, first, total
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("a, beta", [((0.9, 0.4, 0.19**0.5 * 0.4), 3.0), ((0.8, 0.6), 4.0)])
 def test_indices_of_a_plane(key, a, beta):
     a = np.array(a) / np.linalg.norm(a)
@@ -54,7 +54,7 @@ def test_indices_of_a_plane(key, a, beta):
     assert str(found).splitlines()[1].startswith("x[0]") and "first order" in str(found)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_number_that_does_nothing_has_none(key):
     sim = plane((1.0, 0.0), 2.5)
     estimate = jast.estimate.failure_probability(key, sim, 10_000)
@@ -100,7 +100,7 @@ def test_indices_of_choices(key):
     assert found.evaluations > 500 * 5  # tilts are drawn again
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_walk_that_ends_early_has_the_model_behind_its_end(key):
     """What comes after the end decides nothing: total 0 where no failure takes so long."""
     sim = walk(fails=lambda s: s > 1.5, horizon=2)
@@ -117,7 +117,7 @@ def test_plain_draws_serve(key):
     assert len(totals) == 4 and max(totals) - min(totals) < 0.3 * max(totals)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_what_indices_refuse(key):
     sim = hyperplane()
     good = jast.estimate.failure_probability(key, sim, 5000)

@@ -157,7 +157,7 @@ def test_all_of_sixty_turned_modes_are_found(key):
     assert (np.linalg.norm(found, axis=1) < 5.1).sum() >= 57
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["2 of 10", "series 60"])
 def test_many_modes_are_answered(name):
     """Forty-five corners and sixty planes: within 4 standard errors, of 3 % at the most."""

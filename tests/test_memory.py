@@ -42,7 +42,7 @@ def met(calls, monkeypatch, work, room):
     return seen, sum(step() is not None for step in steps)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @maps
 def test_programs_of_dead_simulators_go(monkeypatch, key):
     work = lambda key, sim: jast.nominal(key, sim, 16)
@@ -93,7 +93,7 @@ CALLS = {
 }
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("name", CALLS)
 def test_what_does_not_fit_says_so_before_it_starts(name, monkeypatch, key):
     monkeypatch.setattr(memory, "available", lambda: 50_000)

@@ -207,7 +207,7 @@ def test_iterations_add_up(dtype):
         np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-5)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @settings(max_examples=30, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1), double=st.booleans(), least=st.sampled_from([0.0, 3.0]))
 @example(seed=5138, double=False, least=0.0)
@@ -248,7 +248,7 @@ def test_padding_is_nothing(dtype):
         np.testing.assert_allclose(a, b, rtol=1e-4 if dtype == "float32" else 1e-10, atol=1e-5)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_small_component_keeps_its_covariance(dtype):
     """The third component has two points: fewer than three keep their covariance, and it takes two
     by default (d).
@@ -319,7 +319,7 @@ def test_em_never_returns_nan(x, w, dtype):
         assert np.isfinite(np.linalg.cholesky(np.asarray(got.covariances, np.float64))).all()
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @settings(max_examples=60, deadline=None)
 @given(
     seed=st.integers(0, 2**32 - 1),

@@ -80,7 +80,7 @@ def test_slopes_are_the_responses_to_each_gust(dtype):
     assert sure.sum() > STEPS / 2
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_gradient_is_that_of_the_differences(dtype):
     point = np.full(100, 0.1).astype(dtype)
     by_gradient = slopes(plane(100), point, gradients=True)
@@ -90,7 +90,7 @@ def test_a_gradient_is_that_of_the_differences(dtype):
         assert here.distance == pytest.approx(3.5 - 1.0, abs=1e-4)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_the_lane_is_answered_with_two_thousand_runs(dtype):
     truth, error = probability_of_lane()
     assert truth == pytest.approx(5.0355e-5, rel=0.01) and error < 0.005 * truth
@@ -99,7 +99,7 @@ def test_the_lane_is_answered_with_two_thousand_runs(dtype):
     assert abs(p.mean - truth) < 4 * p.standard_error < 0.4 * truth
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_black_box_runs_as_often_as_it_says():
     SlowLane.runs = 0
     p = failure_probability(jax.random.key(0), slow_lane(), 1500)
@@ -107,7 +107,7 @@ def test_a_black_box_runs_as_often_as_it_says():
     assert p.reliable and abs(p.mean / 5.0355e-5 - 1) < 4 * p.relative_error < 0.5
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "budget, gradients, error", [(1200, True, 0.06), (1200, False, 0.06), (300, True, 0.15)]
 )
@@ -134,7 +134,7 @@ def test_the_audit_by_wide_noise_tells_of_another_plane():
     assert found.reasons == (FORGOTTEN,) and found.spent - state.spent < 0.5 * f.budget
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_planes_behind_another_are_found_or_missed_aloud():
     """What is believed lies within a factor of 1.5, or 4 of its standard errors."""
     depths = 3.5, 3.6, 3.7
@@ -155,7 +155,7 @@ def _either_side(z):
     return 3.7 - jnp.abs(jnp.sum(z[:25]) / 5 + 0.2)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "g, truth",
     [
@@ -168,7 +168,7 @@ def test_two_half_spaces_are_both_found_or_missed_aloud(g, truth):
     assert not p.reliable or abs(p.mean / truth - 1) < max(4 * p.relative_error, 0.1)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_where_no_slope_leads_plain_draws_answer():
     p = failure_probability(jax.random.key(0), limit_state(lambda z: 3.0 + 0 * z[0], 30), 400)
     assert not p.reliable and np.isnan(p.mean) and p.evaluations == 400
@@ -177,7 +177,7 @@ def test_where_no_slope_leads_plain_draws_answer():
     assert often.reliable and abs(often.mean - 0.5) < 4 * often.standard_error
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_stress_tells_the_probability_of_the_lane_from_two_thousand_runs():
     report = jast.stress(jax.random.key(1), lane(), 2000)
     p = report.probability

@@ -69,7 +69,7 @@ def test_rate_of_a_known_system(key, equal):
     assert "likeliest failure" in str(r)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_counts_are_those_of_the_episodes(key):
     """Steps, failures and the first one, against every episode played by itself."""
     sim, n = walk(), 301  # no multiple of any number of lanes
@@ -151,7 +151,7 @@ def test_uniform_actions(key, equal):
     archive_replays(near, monte_carlo(key, near, episodes=20_000, **S0), S0["reward"], equal)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_invalid_episodes_are_counted_and_never_best(key):
     sim = walk(step=lambda s, x: jnp.where(x > 1.5, jnp.nan, s + x))
     r = monte_carlo(key, sim, episodes=2000, refine=0)
@@ -168,7 +168,7 @@ def test_invalid_episodes_are_counted_and_never_best(key):
     assert r.best_reward_per_tree == -np.inf
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_systems_that_never_or_always_fail(key):
     r = monte_carlo(key, walk(fails=lambda s: s > 1e9), episodes=300)
     assert (r.failing_share, r.first_failure, r.failures.size, r.steps) == (
@@ -233,7 +233,7 @@ def test_interruption_and_callback(key, equal, monkeypatch):
     equal(r.failures, monte_carlo(key, walk(), episodes=256).failures)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_progress_bar(key, capsys):
     monte_carlo(key, walk(), episodes=300, progress=True)
     assert "monte_carlo" in capsys.readouterr().err
@@ -278,7 +278,7 @@ def test_best_distinct_episodes():
     assert places.tolist() == [2, 5, 4, 0, 7, 8, 8] and counts.tolist() == [2, 1, 1, 1, 1, 0, 0]
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_the_best_is_a_failure_whatever_a_miss_is_worth(monkeypatch):
     """Of any block of lanes, and of those of one worth the first."""
     monkeypatch.setattr(module, "LANES", 128)

@@ -77,7 +77,7 @@ def test_sierras_minima(x64):
         )
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @settings(max_examples=60, deadline=None)
 @given(x=st.tuples(near, near), thesis=st.booleans())
 def test_sierra_is_that_of_the_text(x, thesis):
@@ -160,7 +160,7 @@ def test_branin(dtype):
     np.testing.assert_allclose(branin(jnp.zeros(2, dtype)), 56 - 10 / (8 * np.pi), rtol=rtol)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("d", [1, 2, 7])
 def test_ackley_and_paraboloid(d, dtype):
     origin = jnp.zeros(d, dtype)

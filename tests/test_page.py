@@ -273,7 +273,7 @@ def test_the_slider_moves_in_a_browser(page, tmp_path):
     assert found["play"] == "Stop"
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_report_in_a_cell_of_a_notebook(monkeypatch):
     """Words are text, each mode has a small picture; without matplotlib there are the words."""
     pytest.importorskip("matplotlib", reason="needs the extra `plot`")

@@ -33,7 +33,7 @@ CASES = {
 }
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("family", CASES)
 def test_the_probability(family):
     """Of a failure above 2: the count is binomial, and |z| < 4.5 but once in 150,000."""

@@ -69,7 +69,7 @@ def test_history_mean_band_and_best():
         plot.history(result(best=np.zeros(3)))
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_disturbances_of_any_structure():
     [ax] = plot.disturbances(HIT)
     np.testing.assert_array_equal(
@@ -97,7 +97,7 @@ def test_disturbances_of_any_structure():
     drawn(plot.disturbances(jast.replay(FERRY, jnp.zeros((0,))))[0])
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_disturbances_by_how_far_out_they_are():
     """A normal number by its standard deviations from its mode, a choice by its rarity."""
     sim = ring()
@@ -152,7 +152,7 @@ def test_settings_of_matplotlib_are_left_alone():
     assert dict(matplotlib.rcParams) == before
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_pictures_are_on_the_door_without_matplotlib():
     code = "import sys, jast; jast.plot.history; sys.exit('matplotlib' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code]).returncode == 0

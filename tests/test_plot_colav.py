@@ -214,7 +214,7 @@ def test_the_story_in_time():
     np.testing.assert_allclose(speed.lines[0].get_ydata(), s.velocity.u)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_the_story_tells_the_kinds_of_disturbance(three):
     sim, episode = three
     x = {kind: np.asarray(a, float) for kind, a in episode.disturbances.items()}
@@ -243,7 +243,7 @@ def test_the_story_tells_the_kinds_of_disturbance(three):
     ]
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "x", "label"),
     [
@@ -265,7 +265,7 @@ def test_the_story_takes_the_longest_delay_of_the_simulator():
     assert plot.colav_story(EPISODE, jast.simulators.walk1d())[0].get_ylabel() == "delay (share)"
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_animation_goes_from_the_first_state_to_the_last():
     animation = plot.colav_animation(SHORT, smooth=2)
     assert not plt.get_fignums()  # or a notebook would show its figure too
@@ -298,7 +298,7 @@ def test_animation_goes_from_the_first_state_to_the_last():
     assert ax.get_position().bounds == position  # it does not tremble
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_headings_turn_the_short_way():
     states = SHORT.states._replace(
         adversary=SHORT.states.adversary._replace(
@@ -315,7 +315,7 @@ def test_headings_turn_the_short_way():
     animation.to_jshtml()
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_animation_is_saved(tmp_path):
     short = SHORT._replace(length=jnp.int32(2))
     plot.colav_animation(short, path=tmp_path / "a.html", smooth=1)

@@ -208,7 +208,7 @@ def test_convergence_is_the_mean_and_its_band():
     assert distance.get_yscale() == "log"
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_convergence_of_uneven_batches_and_of_values_that_are_missing():
     uneven = jax.vmap(
         lambda key: ce_method(
@@ -228,7 +228,7 @@ def test_convergence_of_uneven_batches_and_of_values_that_are_missing():
     assert not single[0].collections and not single[1].collections
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_sierra_is_drawn_as_printed():
     """Six panels; the least of the third is the optimum of Table 2.1."""
     panels = plot.sierra()

@@ -29,7 +29,7 @@ def route(courses=(240.0, 200.0)):
 # fms
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_the_failing_arc_is_shown(x64):
     sim = fms()
     episode = jast.replay(sim, route())
@@ -59,7 +59,7 @@ def test_the_failing_arc_is_shown(x64):
     assert "1, 2" in [text.get_text() for text in ground.texts]
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_other_routes_are_drawn(x64):
     sim = fms()
     sound = plot.fms(
@@ -74,7 +74,7 @@ def test_other_routes_are_drawn(x64):
     assert not empty[1].lines and len(lines(empty[0], "predicted path")[0]) == 2
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_fms_asks_for_an_episode_of_its_own(x64):
     sim = fms()
     episode = jast.replay(sim, route())

@@ -254,7 +254,7 @@ def test_weights_of_any_kind():
         plot.weights({"none": traces(np.zeros(9), np.zeros(9, bool))})
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_fan_of_an_archive_and_its_labels():
     archive = jast.search.monte_carlo(jax.random.key(0), WALK, episodes=5000, refine=0, top=8)
     for found in (archive, archive.failures):

@@ -19,7 +19,7 @@ def said(figure):
     return [text.get_text() for text in figure.texts]
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_report_on_one_page(tmp_path):
     figure = plot.report(made(probability=estimate()), nominal=20, units={"speed": "m/s"})
     words = said(figure)
@@ -51,7 +51,7 @@ def test_a_report_on_one_page(tmp_path):
     plt.close(figure)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_what_must_not_be_believed_says_so_and_why():
     doubt = estimate(reliable=False, warnings=("18% of what was found costs $5 " + "or so " * 30,))
     figure = plot.report(made(probability=doubt), nominal=0)

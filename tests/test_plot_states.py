@@ -51,7 +51,7 @@ def test_names_of_any_pytree():
     assert named_fields({"deep": {"speed": np.zeros(1)}}, "s")[0].name == "deep.speed"
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_traces_of_a_nested_state_against_nominal_bands():
     few = played(RING, 5)
     axes = plot.traces(few, RING, nominal=40, units={"gusts": "m/s"}, modes=[0, 1, 0, 0, 1])
@@ -73,7 +73,7 @@ def test_traces_of_a_nested_state_against_nominal_bands():
     assert words[3].startswith("mode 1: 3") and words[4].startswith("mode 2: 2")
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_the_bands_are_quantiles_of_those_that_still_run():
     usual = played(FERRY, 30)
     [ax] = plot.traces(usual, FERRY, "x", nominal=usual, most=1)
@@ -90,7 +90,7 @@ def _states(episodes):
     return jax.vmap(lambda e: jast.replay(FERRY, e))(episodes).states
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_phase_portrait():
     few = played(FERRY, 3)
     ax = drawn(plot.phase(few, FERRY, ("x", "y"), nominal=0))
@@ -106,7 +106,7 @@ def test_a_phase_portrait():
     assert (default.get_xlabel(), default.get_ylabel()) == ("x", "y")  # ferry_x is as undisturbed
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_black_box_shows_its_disturbances_or_what_it_says():
     """Judged at its end it has no state; an object has a distance at each step."""
     kinds = Joint({"gust": Normal(0.0, 1.0), "bias": Normal(0.0, 1.0)})
@@ -145,7 +145,7 @@ def test_a_black_box_shows_its_disturbances_or_what_it_says():
     np.testing.assert_allclose(paths(ax)[0].get_ydata(), [9, 8, 7, 6])
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_what_traces_and_portraits_refuse():
     few = played(FERRY, 2)
     for draw in (plot.traces, plot.phase):

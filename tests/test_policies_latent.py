@@ -33,7 +33,7 @@ DISTRIBUTIONS = dict(
 )
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("name", mark_long(DISTRIBUTIONS, "uniform", "tent"))
 def test_a_moved_and_a_blended_distribution_have_mass_one_and_their_own_samples(name, key):
     """By quadrature in x, and by the share of draws below a point."""
@@ -141,7 +141,7 @@ def test_only_the_last_distance_counts_where_shaping_is_at_the_end():
     assert lane.over and not lane.failed
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_an_episode_is_judged_as_a_rollout_is(key):
     """Outcome, length and miss distance of lanes are those of `jast.replay`, on systems with and
     without an early end.
@@ -213,7 +213,7 @@ def test_the_ring_buffer_holds_the_latest_valid_rows():
     np.testing.assert_array_equal(buffer.z[:, 0], buffer.t)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_the_fit_of_a_start_finds_unequal_modes(key):
     """log_value such that p exp(value) is a known mixture, far out and without symmetry; the first
     component is the model itself.
@@ -244,7 +244,7 @@ def test_first_components_are_far_apart_in_deviations(seed):
     assert sorted(first.means[:, 1].tolist()) == [0, 2]
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("value", [-jnp.inf, jnp.nan])
 def test_where_nothing_is_known_the_start_is_the_model(value, key):
     tilt = fit_tilt(key, lambda z: jnp.full((), value, jnp.float32), 1, samples=64, rounds=1)
@@ -267,7 +267,7 @@ def test_the_entropy_of_the_model_neither_gains_nor_loses():
     )
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_networks_start_as_those_of_heads(key):
     """Uniform in +-1/sqrt(fan-in), all arrays different."""
     new = init_learner(key, 2, 1, (64, 32), 2, jnp.float32(1.0))

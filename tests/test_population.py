@@ -175,7 +175,7 @@ def near(runs, truth, most=4.0):
     return abs(a.log_mean - np.log(truth)) < most * a.relative < most * MAX_WITNESS_ERROR
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("way", ["distance", "width"])
 @pytest.mark.parametrize(
     "sim, truth", [(HALF, stats.norm.sf(3)), (SIDES, 2 * stats.norm.sf(3))], ids=["one", "two"]
@@ -198,7 +198,7 @@ def test_episodes_that_end_early_count_only_their_own_numbers(key):
     assert near(runs, 9.578759495e-4) and runs[0].used.min() < 10
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_choices_and_distances_of_few_values(key):
     """At least 18 of 20 coins of 1/2 (P = 211 / 2^20), with the heads that lack as the distance."""
     sim = jast.Simulator(
@@ -221,7 +221,7 @@ def test_a_distance_that_never_changes_leads_nowhere(key):
     assert near(runs, stats.norm.sf(3.5))
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_in_both_precisions(dtype, key):
     sim = limit_state(lambda u: 3.0 - u[0], 2)
     runs = [ways.by_distance(k, sim, N, 10, N) for k in jax.random.split(key, 3)]
@@ -256,7 +256,7 @@ def two():
     return population(jax.random.key(1), SIDES, 200_000, particles=N)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_two_ways_agree_and_their_answer_holds(two):
     truth = 2 * stats.norm.sf(3)
     assert two.reliable and abs(two.log_mean - np.log(truth)) < 4 * two.relative_error
@@ -282,7 +282,7 @@ def test_an_estimate_with_a_sample_is_saved(two, tmp_path, equal):
     assert again.plain == two.plain and str(again) == str(two)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_the_same_bits_wherever_populations_run(two, tmp_path):
     """By an executor, on two devices, and from a checkpoint, which runs nothing again."""
     call = lambda **more: population(jax.random.key(1), SIDES, 200_000, particles=N, **more)
@@ -352,7 +352,7 @@ def test_what_misleads_the_distance_is_not_missed_silently(key):
     assert right or not found.reliable
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_no_failure_leaves_what_plain_draws_guarantee(key):
     found = population(key, NEVER, 100_000, particles=256)
     assert np.isnan(found.mean)
@@ -362,7 +362,7 @@ def test_no_failure_leaves_what_plain_draws_guarantee(key):
     assert str(found).index("between 0 and") < str(found).index("failures")
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("beta", [-9.0, 0.0, 1.0])
 def test_frequent_failures_are_counted(key, beta):
     found = population(key, limit_state(lambda u: beta - u[0], 2), 60_000, particles=N)
@@ -373,7 +373,7 @@ def test_frequent_failures_are_counted(key, beta):
     assert found.interval[0] <= truth <= found.interval[1] and found.mean <= 1
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_invalid_episodes_are_told_and_never_failures(key):
     """NaN where the second number is above 1: a sixth of all, which might all fail."""
     sim = limit_state(lambda u: jnp.where(u[1] > 1, jnp.nan, 3.2 - u[0]), 2)
@@ -385,7 +385,7 @@ def test_invalid_episodes_are_told_and_never_failures(key):
     assert abs(found.log_mean - np.log(truth)) < 4 * found.relative_error
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_invalid_episodes_may_all_be_failures_in_what_is_guaranteed(key):
     """Of a system whose every number is NaN nothing is guaranteed; of one with a sixth of NaN and
     no failure the upper end is above that sixth.
@@ -494,7 +494,7 @@ def test_seconds_of_a_black_box_are_of_the_clock(key):
     assert budget >= 50 and not budgets.uses_populations(slow, 10**7)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_stress_by_populations_tells_both_modes(key):
     """Two half-planes: e^-4.5 each, half of the probability each."""
     report = jast.stress(key, SIDES, 500_000)
@@ -514,7 +514,7 @@ def test_a_second_key_compiles_nothing(key):
     assert not programs
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_plain_draws_are_in_the_checkpoint(key, tmp_path, monkeypatch):
     sim = limit_state(lambda u: 1.0 - u[0], 2)
     found = population(key, sim, 100_000, particles=N, checkpoint=tmp_path)

@@ -27,7 +27,7 @@ def plane():
     return population(jax.random.key(3), PLANE, 300_000)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_gaussians_of_the_failures_draw_the_last_part(plane):
     """A half-space is what one Gaussian fits: some 1 % by less than 300,000 evaluations, where
     populations come to 4 %.
@@ -38,7 +38,7 @@ def test_gaussians_of_the_failures_draw_the_last_part(plane):
     assert plane.interval[0] < stats.norm.sf(4) < plane.interval[1]
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_what_populations_left_stays(plane, key):
     """Their failures, as a `Sample`; the draws, which further answers use, are those of Gaussians;
     the model's own draws guarantee an interval.
@@ -56,7 +56,7 @@ def test_the_same_bits_with_a_checkpoint(plane, tmp_path):
         assert kept.log_mean == plane.log_mean and kept.interval == plane.interval
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("v, serves", [(0.1, False), (0.8, True)])
 def test_weights_without_a_variance_are_left_after_a_pilot(key, monkeypatch, v, serves):
     """The model over N(m, v I) has the Pareto shape 1 - v where m is the likeliest failure of a
@@ -75,7 +75,7 @@ def test_weights_without_a_variance_are_left_after_a_pilot(key, monkeypatch, v, 
     assert abs(found.log_mean - stats.norm.logsf(4)) < 4 * found.relative_error
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_where_no_gaussians_serve_populations_answer(key):
     """Any of 200 numbers is great: 400 modes, P = 1 - (1 - 2 Phi(-4.5))^200."""
     found = population(key, ANY, 400_000)
@@ -84,7 +84,7 @@ def test_where_no_gaussians_serve_populations_answer(key):
     assert abs(found.log_mean - truth) < 4 * found.relative_error
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("factor, words", [(0.5, "against populations"), (1.0, None)])
 def test_populations_check_it(key, monkeypatch, factor, words):
     """Half the probability, as where a mode were missing, is flagged."""
@@ -136,7 +136,7 @@ def test_an_interruption_of_the_pilot_is_the_end_of_the_draws(key, monkeypatch):
     assert not found.reliable and "interrupted" in found.warnings[0]
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_the_first_population_by_width_costs_as_much_as_it_may(key):
     """In 400 numbers the way from width 2 to 1 has some 24 widths; the guess of their number is
     right to a fifth.
@@ -169,7 +169,7 @@ def test_where_no_way_leads_to_failures_the_rest_is_plain_draws(key, monkeypatch
     assert "plain draws" in found.method and found.evaluations == 200_000
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_sensitivities_are_told_by_the_gaussians_that_drew(key):
     """d log P / d mean of 20 numbers N(m, 1), P = Phi(sqrt(20) m - 4), m = 0."""
     noise = jax.tree_util.Partial(lambda m, s: D.Normal(m, 1.0), jnp.zeros(()))

@@ -105,7 +105,7 @@ def drawn(key, n=64):
     )
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_an_update_goes_along_the_gradients(key):
     """Adam's first step is the rate in the sign of each gradient: of the critic's squares, and for
     the actor, whose ratio is still 1, of the mean of A log pi.
@@ -278,7 +278,7 @@ def test_a_saved_start_is_the_same(equal, tmp_path):
     equal(jast.load(tmp_path / "policy", sim).learned, policy.learned)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_what_is_not_finite_is_counted_and_never_learned_from():
     """A tenth of the episodes and more come to a state that is NaN: every parameter stays finite,
     and failures are still found.

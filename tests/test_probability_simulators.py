@@ -20,7 +20,7 @@ ALL = {"pendulum": pendulum, "autoregression": autoregression, "ruin": ruin}
 LIKE_NUMBERS = {"pendulum": (0.2, 0.3, 1.0, 0.5), "autoregression": (0.3, 2.0), "ruin": (0.45,)}
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("name", mark_long(ALL, "autoregression"))
 def test_sweep_and_gradient(name, key):
     """A batch of parameters gives the episodes of each, and every gradient is finite, after the end
@@ -113,7 +113,7 @@ def test_pendulum_step():
 # autoregression
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_autoregression_truth(key):
     coarse, fine = (autoregression_probability(0.1, 5.0, 100, n) for n in (150, 220))
     assert coarse == pytest.approx(fine, rel=1e-9)
@@ -127,7 +127,7 @@ def test_autoregression_truth(key):
 # ruin
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_ruin_truth(key):
     step = np.diag(np.full(30, 0.4), 1) + np.diag(np.full(30, 0.6), -1)
     step[0], step[30] = np.eye(31)[0], np.eye(31)[30]
@@ -203,7 +203,7 @@ def test_curved_truths_by_closed_forms():
     )
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("family", limit_states.FAMILIES)
 def test_family(family):
     drawn = [limit_states.draw(family, seed) for seed in range(4)]

@@ -31,7 +31,7 @@ def learned():
     return q_learning(KEY, TWO_STEPS, **SMALL)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_it_shares_the_way_evenly_on_both_sides(learned):
     # half a column of the table, .25, and half a cell, at most .2, beside the best
     for side in (-1.0, 1.0):
@@ -46,7 +46,7 @@ def test_it_shares_the_way_evenly_on_both_sides(learned):
     assert "lambda" in str(learned) and learned.episodes >= 4000
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_importance_sampling_by_it_agrees_with_the_truth(learned):
     proposal = jast.estimate.policy_proposal(TWO_STEPS, learned)
     found = jast.estimate.importance(jax.random.key(5), TWO_STEPS, proposal, 20_000)
@@ -87,7 +87,7 @@ def test_it_goes_on_from_a_checkpoint_to_the_same_bits(learned, tmp_path):
     jax.tree.map(np.testing.assert_array_equal, whole.learned, learned.learned)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_cells_of_the_users_own_and_numbers_that_are_not_finite():
     sim = jast.Simulator(
         lambda x0: jnp.zeros(()),

@@ -69,7 +69,7 @@ def test_on_a_knife_edge_the_replay_counts(key, monkeypatch):
     assert float(result.failures.best.reward) > float(found.best.reward)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_slips_of_whole_numbers_are_taken_out(key):
     """No slope leads anywhere: removals alone."""
     sim = CASES["slips"].make()
@@ -120,7 +120,7 @@ def test_a_mode_that_moves_with_the_state(key):
     assert float(result.failures.best.reward) == pytest.approx(math.log(1 - 0.2), abs=0.005)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_modes_are_the_origin_of_a_centred_simulator(key):
     """Also one at the end of its support, which moves with the state; it has a slope."""
     sim = jast.Simulator(

@@ -85,7 +85,7 @@ def made(name):
     return (MAKERS | OTHERS)[name]()
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("name", mark_long([*MAKERS, *OTHERS], "forest", "sac"))
 def test_a_repr_is_short_and_the_table_of_a_notebook_names_every_field(name):
     value = made(name)
@@ -101,7 +101,7 @@ def test_a_repr_is_short_and_the_table_of_a_notebook_names_every_field(name):
     assert table.count("<tr>") == table.count("</tr>") >= len(fields) and len(table) < 5000
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("name", mark_long(MAKERS, "sac"))
 def test_every_result_has_the_whole_vocabulary(name):
     value = made(name)
@@ -142,7 +142,7 @@ def test_a_former_name_warns(name, old, new):
         assert getattr(value, old) is getattr(value, new)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_batched_and_a_traced_result_print_and_say_so():
     seen = []
 
@@ -249,7 +249,7 @@ def same(a, b, at="result"):
 FILED = [*MAKERS, "episode", "failures", "heads", "traces", "history", "roots"]
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("name", mark_long(FILED, "sac"))
 def test_a_file_gives_the_result_back_to_the_bit(name, tmp_path):
     value, path = made(name), tmp_path / "result"
@@ -303,7 +303,7 @@ def own_simulator():
     )
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_states_of_an_own_class_need_the_simulator(tmp_path):
     own, path = own_simulator(), tmp_path / "s"
     found = jast.search.monte_carlo(KEY, own, episodes=300, top=3)
@@ -315,7 +315,7 @@ def test_states_of_an_own_class_need_the_simulator(tmp_path):
         jast.load(path, WALK)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_batch_nested_none_and_texts_are_kept(tmp_path):
     keys = jax.random.split(KEY, 2)
     batch = jax.vmap(lambda key: jast.search.monte_carlo(key, WALK, episodes=100))(keys)

@@ -48,7 +48,7 @@ def test_float64_is_fine(x64):
     assert rounding_problem(walk(4.6e6)) is None
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_check_and_the_estimate_say_so(key):
     with pytest.warns(UserWarning, match="check: step: the state is too coarse"):
         jast.check(walk(4.6e6))

@@ -150,7 +150,7 @@ def whole_run(tmp_path_factory):
     return whole_training(train, tmp_path_factory.mktemp("sac") / "whole.jast")
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_the_callback_gets_the_rows_of_the_history(whole_run):
     check_rows(*whole_run[:2])
 
@@ -163,7 +163,7 @@ def test_an_interrupted_training_goes_on_to_the_same_bits(whole_run, equal, tmp_
     check_training_goes_on(train, whole_run[0], tmp_path / "run.jast", equal)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_checkpoint_of_another_training_is_refused(whole_run):
     path = whole_run[2]
     with pytest.raises(
@@ -195,7 +195,7 @@ def test_a_saved_policy_is_the_same(learned, equal, tmp_path, key):
     equal(jast.rollout(key, TWO_SIDES, again), jast.rollout(key, TWO_SIDES, learned))
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_file_that_does_not_fit_is_refused(learned, whole_run, tmp_path):
     path = tmp_path / "policy.npz"
     save(path, learned)

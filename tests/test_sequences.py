@@ -82,7 +82,7 @@ def test_quantile_is_exact_for_normals_far_out(dtype):
     ] == [5, 22]
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_other_disturbances_by_their_quantile_function(dtype):
     z = jnp.asarray([-9.0, -1.0, 0.0, 2.0, 9.0], dtype)
     x = D.from_normal(D.Uniform(jnp.full(5, 2.0, dtype), jnp.full(5, 4.0, dtype)), z)
@@ -122,7 +122,7 @@ def test_noise_is_addressed(key):
     assert sample(key, standard_normal(scalar("float32"), 2), 2).tolist() == long[1:3].tolist()
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("make", [walk, ring], ids=["walk", "ring"])
 def test_player_at_standard_noise_is_the_model(key, make):
     """The share of failures is the nominal one within 4 standard errors of the two binomial shares;
@@ -196,7 +196,7 @@ def test_latent_is_the_inverse_of_quantile(dtype):
     assert D.to_normal(D.Fixed(), ()) == ()
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_latent_of_whole_numbers(dtype):
     """The middle in probability of the normal numbers that give it, rare numbers last, by scipy; so
     it goes back to it.

@@ -85,7 +85,7 @@ def covered(sim, heads, share, proposals):
     return inside, np.mean(widths)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "case", [sides(3.0, 3.2), axes(3.0, 3.3, 6)], ids=["sides", "two weights in 6 dimensions"]
 )

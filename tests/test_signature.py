@@ -99,7 +99,7 @@ class Odd(D.Normal):
         raise TypeError("no quantile today")
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_what_raises_is_not_offered_and_not_missed(key):
     sim = jast.Simulator(
         lambda x0: jnp.zeros(()),
@@ -159,7 +159,7 @@ def of(scale, limit, calls=None):
     )
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("transform", [jax.vmap, jax.jit, lambda f: jax.jit(jax.vmap(f)), jax.grad])
 def test_of_a_traced_simulator(transform):
     """The same as outside, traced once for all of a kind, and nothing of the trace is left."""

@@ -53,7 +53,7 @@ ALL = {
 CASES = mark_long(ALL, "walk1d one-sided", "limit_state of 200")
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("name", CASES)
 def test_contract(name, key):
     sim = ALL[name]()
@@ -64,7 +64,7 @@ def test_contract(name, key):
     assert found.rate < 0.2
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("name", CASES)
 def test_dtypes(name):
     for enabled, expected in ((False, jnp.float32), (True, jnp.float64)):
@@ -187,7 +187,7 @@ def test_limit_state_truths():
         )
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_limit_state_rate(key):
     found = jast.nominal(key, limit_state(four_branch, 2), episodes=100_000)
     assert abs(found.rate - 2.2227950662e-3) < 4 * np.sqrt(2.2227950662e-3 / 100_000)
@@ -240,7 +240,7 @@ def shifted(level, x):
     return level - x[0]
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "first, second",
     [

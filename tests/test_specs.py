@@ -68,7 +68,7 @@ traces = st.lists(st.floats(-4, 4, width=16), min_size=2 * T, max_size=2 * T).ma
 )
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @settings(max_examples=60, deadline=None, derandomize=True)
 @given(formulas(), traces)
 def test_robustness_is_that_of_brute_force(f, trace):
@@ -82,7 +82,7 @@ def test_robustness_is_that_of_brute_force(f, trace):
     assert found == brute(f, trace)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @settings(max_examples=60, deadline=None, derandomize=True)
 @given(formulas(), traces, st.sampled_from([1, 2, 3]))
 def test_the_monitor_knows_the_bound_of_brute_force(f, trace, block):
@@ -146,7 +146,7 @@ def test_the_smooth_version_comes_near_and_is_smooth(name, x64):
     assert float(slope["x"][3]) == pytest.approx(change, abs=1e-4)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_ties_share_a_gradient_without_nan():
     for f in FORMULAS.values():
         for how in (dict(), dict(temperature=0.1), dict(goes_on=True)):

@@ -56,7 +56,7 @@ def test_until_of_rtamt_leaves_the_last_moment_out(x64):
         assert float(robustness(until(X, Y, 0, 6), trace, 1.0)) <= told
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_stljax(x64):
     F = pytest.importorskip("stljax.formula")
     p = F.Predicate("x", lambda s: s[..., 0]) > 0.2

@@ -53,7 +53,7 @@ FORMULAS = {
 }
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("name", FORMULAS)
 def test_an_episode_ends_where_the_violation_is_certain(name, key):
     """Against the whole trace, drawn by the system alone; and the bound of all shorter ones."""
@@ -161,7 +161,7 @@ class Free(Walk):
         return False
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_black_box_takes_a_formula(key):
     """It must be back above -1 within two steps; its own failure plays no part."""
     box = jast.blackbox.from_python(Free, horizon=6, disturbance=Normal(0.0, 1.0))
@@ -175,7 +175,7 @@ def test_a_black_box_takes_a_formula(key):
         assert float(robustness(back(lambda s: s + 1), trace, 1.0, goes_on=True)) < 0
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_steps_of_several_samples(key):
     """Two gusts a step, a sample each: as one gust a step."""
     two = jast.Simulator(

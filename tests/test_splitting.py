@@ -155,7 +155,7 @@ def off(found, truth):
 # right
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("killed", [0.01, 0.25, 0.5])
 def test_the_levels_are_unbiased_where_scores_tie(killed):
     """Of 8 particles, the whole algorithm without the device."""
@@ -205,7 +205,7 @@ CASES = {
 }
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["ties", "a random start", "invalid episodes"])
 def test_the_mean_of_small_runs_is_right(name, key):
     """Few particles a run, where a bias would be greatest."""
@@ -239,14 +239,14 @@ def test_intervals_cover(key):
     assert covers >= 51
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_float64(key):
     with jax.enable_x64(True):
         found = splitting(key, autoregression(), 60, runs=20)
         assert off(found, TRUTH) < MAX_ERRORS
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_steps_and_episodes_are_counted(key):
     """Every episode of a system that neither ends nor fails before its horizon has all steps, and a
     branch only those after it.
@@ -264,7 +264,7 @@ def test_steps_and_episodes_are_counted(key):
     assert found.episodes == math.ceil(found.steps / STEPS)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_the_same_key_the_same_answer_and_a_checkpoint_goes_on(key, tmp_path):
     first = splitting(key, autoregression(), 100, runs=3, checkpoint=tmp_path)
     told = []
@@ -283,7 +283,7 @@ def test_the_same_key_the_same_answer_and_a_checkpoint_goes_on(key, tmp_path):
 # black boxes
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", [Walker, Saved])
 def test_objects_go_on_from_where_they_were(kind, key):
     """Deep copies, and the object's own snapshots: transitions as counted by the object itself."""
@@ -325,7 +325,7 @@ def test_objects_and_arrays_come_to_the_same_in_the_mean(key):
     assert apart < MAX_ERRORS * math.hypot(ours.standard_error, theirs.standard_error)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_what_goes_wrong_in_an_object_is_an_invalid_episode(key):
     class Raises(Walker):
         def miss_distance(self):
@@ -435,7 +435,7 @@ def test_objects_in_other_processes_cannot_branch(key):
         splitting(key, black_box(Walker, workers=1))
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_score_that_says_nothing_is_flagged(key):
     """All particles tie, and no level can be set; where one fails, plain draws are what is left."""
     found = splitting(key, autoregression(), 50, runs=3, score=lambda s: jnp.zeros(()))

@@ -16,7 +16,7 @@ from jast.cross_entropy import ask, ce_method, ce_surrogate, finish, over, start
 METHOD = dict(samples=50, elites=15, iterations=6)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_points_of_a_walk(dtype):
     """z is the disturbance where it is N(0, 1): the miss distance, or -1 / (1 + c) with c = sum z^2
     / 2 up to the failure.
@@ -63,7 +63,7 @@ def test_failures_before_the_rest_whatever_the_units(key):
     assert value[0] > 0 > value[1] > value[2] > value[3]
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_start_and_structures(key):
     """Random start, dicts, integers: D counts them all, and quantiles make draws of the model (its
     failing share, within 4 standard errors).

@@ -28,7 +28,7 @@ def test_a_truth_is_within_the_error_of_plain_draws(name):
     assert abs(failing - expected) < 4.5 * np.sqrt(expected * (1 - problem.truth))
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["RP14", "RP60", "RP110"])
 def test_a_simulator_fails_where_the_problem_does(name):
     """Its distributions are those of SciPy, its limit state that of NumPy, but for rounding."""

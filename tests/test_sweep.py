@@ -166,7 +166,7 @@ def test_a_row_that_was_interrupted_is_the_last(key):
     assert len(table.results) == 1
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_results_of_any_kind_have_a_row(key):
     table = jast.sweep(
         key,
@@ -428,7 +428,7 @@ def test_rows_that_are_done_are_not_done_again(key, where, tmp_path, equal):
         jast.sweep(key, sims, {"row": range(1, 5)}, counted, checkpoint=tmp_path)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_row_that_follows_is_the_same_from_a_checkpoint(key, tmp_path):
     go = lambda **how: jast.sweep(key, after_five, {"limit": [8.0, 8.3]}, budget=5000, **how)
 

@@ -67,7 +67,7 @@ def keys(n):
     return list(jax.random.split(jax.random.key(0), n))
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("copies", [1, 4])
 def test_intervals_hold_the_truth_and_ratios_are_sharper(copies):
     """120 curves of 8 rows. All rows of a curve share errors, so coverage is told by curves: the

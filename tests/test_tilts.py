@@ -97,7 +97,7 @@ def joint():
     )
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_parts_of_a_joint():
     d = joint()
     p = parts(d)
@@ -118,7 +118,7 @@ def test_parts_of_a_joint():
     )
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_parts_of_a_mixture(key):
     """The component is a choice; with its number it makes draws of the mixture."""
     d = D.MixtureSameFamily(
@@ -135,7 +135,7 @@ def test_parts_of_a_mixture(key):
     assert np.abs(gaps).max() < 2 / np.sqrt(n)  # Kolmogorov's distance, 1e-3
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_parts_and_back(key):
     """A value gives the numbers and categories that give the value again."""
     mixture = D.MixtureSameFamily(
@@ -160,7 +160,7 @@ def test_parts_and_back(key):
     np.testing.assert_array_equal(component[np.abs(x["m"]) < 3], 0)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_recorded_episodes_play_again(mixed, key):
     """Their categories to the bit, rare ones too; numbers, ends and distances up to rounding."""
     e = jax.vmap(jast.rollout, (0, None))(jax.random.split(key, 300), mixed)
@@ -179,7 +179,7 @@ def test_recorded_episodes_play_again(mixed, key):
         )
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("gates", [1, 3])
 def test_weights_average_to_one(mixed, key, gates):
     """E[p / q] = 1, under tilts of any coefficients, and the host's densities are those of the
@@ -207,7 +207,7 @@ def test_weights_average_to_one(mixed, key, gates):
     np.testing.assert_allclose(on_host, ratio[:, :3], atol=2e-3)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_known_tilt_is_found(mixed):
     """Traces of one tilt, of equal weights, give its means and odds back."""
     f = TiltFamily(mixed, 200_000, search_context(jax.random.key(2)))
@@ -231,7 +231,7 @@ def gambler():
     return sim, failure_probability(jax.random.key(0), sim, BUDGET)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_ruin(gambler):
     found = gambler[1]
     check_estimate(found, ruin_probability(0.4, 1, 15, 100), 0.02)
@@ -242,7 +242,7 @@ def test_ruin(gambler):
     assert abs(k - n * p) < 4 * np.sqrt(n * p) and found.guaranteed[0] < p < found.guaranteed[1]
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_samples_of_tilts(gambler, tmp_path):
     """Failures of the gambler end at his goal; the estimate survives its file."""
     sim, found = gambler
@@ -259,14 +259,14 @@ def test_samples_of_tilts(gambler, tmp_path):
         np.testing.assert_array_equal(a, b)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_first_passage():
     sim = autoregression(threshold=4.5, horizon=40)
     found = failure_probability(jax.random.key(0), sim, BUDGET)
     check_estimate(found, autoregression_probability(0.1, 4.5, 40))
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_populations_answer_where_tilts_do_not_serve(monkeypatch):
     """Gaussians of all steps are not tried, and the answer holds within 4 standard errors."""
     monkeypatch.setattr(by_proposal.Search, "suffices", property(lambda search: False))
@@ -313,7 +313,7 @@ def test_first_passage_of_what_forgets_fast():
         assert low <= truth <= high, str(found)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_several_gaussians_serve_where_one_does_not():
     """What forgets fast waits, then fails within a few steps: at each step the optimal disturbance
     is one of two kinds, and a tilt of one Gaussian (of the best moments, too) has .002 to .04
@@ -332,7 +332,7 @@ def test_several_gaussians_serve_where_one_does_not():
     assert abs(np.exp(three.log_mean) / truth - 1) < 0.25
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("choice", [False, True])
 def test_what_is_decided_at_the_start(key, choice):
     """Forty steps that change nothing: P = Phi(-3.5) of the start, within 4 standard errors."""
@@ -354,7 +354,7 @@ def test_a_distance_that_tells_nothing_ends_flagged(key):
     assert not jast.estimate.failure_probability(key, latch(), 5000).reliable
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("problem, seed", [(720011, 10011), (740064, 20064)])
 def test_no_side_of_a_walk_is_lost_without_a_word(problem, seed):
     """At 10,000 evaluations these walks to either side once were .84 and .61 of the truth, by 3.9

@@ -22,7 +22,7 @@ def told(sim, words):
     return words in text
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_good_systems_have_none():
     for sim in (line(), ring(), dice(), walk(), jast.simulators.ruin(), jast.simulators.pendulum()):
         assert traps(sim) == []
@@ -58,7 +58,7 @@ def pole(resets, at_random=False):
     return line(init=init, step=step, evaluate=lambda s: (gap(s) < 0, gap(s)), horizon=200)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("at_random", [False, True])
 def test_a_state_that_jumps_back_to_its_start(at_random):
     assert told(pole(True, at_random), "jumps back to its start")
@@ -110,7 +110,7 @@ def stopped(s, x):
     return jax.lax.stop_gradient(s + x)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_miss_distance_without_slopes():
     assert told(line(step=stopped), "its gradient is 0 everywhere")
     beside = lambda s, x: jax.lax.stop_gradient(s) + x  # the disturbance of a step gets through
@@ -139,7 +139,7 @@ def keyed(start=False, fold=False):
     return line(init=init, step=step, evaluate=lambda s: (s[0] > 9, 9 - s[0]), **more)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_key_in_the_state():
     assert told(keyed(), "init: state leaf [1] looks like a random key that no disturbance reaches")
     assert traps(keyed(start=True)) == traps(keyed(fold=True)) == []
@@ -165,7 +165,7 @@ def test_whole_numbers_that_are_no_key():
     assert told(sim, "init: state leaf [2] looks like a random key")
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_step_that_is_large(monkeypatch):
     """What is in a loop counts once, what a loop of Python writes down counts each time."""
 
@@ -182,7 +182,7 @@ def test_a_step_that_is_large(monkeypatch):
     assert traps(line(step=partial(many, n=3))) == traps(line(step=looped)) == []
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_check_tells_them():
     for sim in (line(step=stopped), far(1e7, jnp.float32), keyed(), pole(True)):
         with pytest.warns(UserWarning, match="check: (step|init): "):
@@ -218,7 +218,7 @@ def under(net, **keywords):
     return dataclasses.replace(BASE, step=Partial(steered, net, **keywords))
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_functions_among_the_leaves_of_an_argument(key, traced):
     """They are static beside the weights, which are traced."""
     bound = under(Net(jnp.ones(()), jnp.tanh), gain=2.0)

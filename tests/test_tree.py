@@ -90,7 +90,7 @@ def test_builds_the_tree_of_an_independent_search(key, k, alpha):
     agree(key, k, alpha)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_builds_the_tree_of_an_independent_search_with_spread_and_focused_actions(key):
     agree(key, 2.0, 0.5, focus=0.25)
 
@@ -109,7 +109,7 @@ def test_builds_the_tree_of_an_independent_search_that_uses_its_best_episode(key
     agree(key, 2.0, 0.5, x=28.0, **dict.fromkeys(switches, True))  # nearer to a collision
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_builds_the_tree_of_an_independent_search_in_float64(key, x64):
     agree(key, 2.0, 0.5)
 
@@ -279,7 +279,7 @@ def same_bytes(a, b):
         assert (x.dtype, x.shape, x.tobytes()) == (y.dtype, y.shape, y.tobytes())
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @given(tree=st.lists(arrays(DTYPES), max_size=4))
 @settings(max_examples=25, deadline=None)
 def test_records_give_back_every_bit(tree):
@@ -416,7 +416,7 @@ def test_a_node_costs_its_edges_and_its_state():
     assert a_node(large(1000), "node") - a_node(large(0), "node") == 4000
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_trees_that_do_not_fit_are_refused_with_the_numbers():
     ran = []
     with pytest.raises(
@@ -441,7 +441,7 @@ def test_trees_that_do_not_fit_are_refused_with_the_numbers():
     assert not ran
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_states_that_do_not_fit_at_nodes_are_kept_at_roots():
     sim, size = large(2000), dict(trees=2, prunes=3, simulations=120, threads=1)
     node, root = (

@@ -30,7 +30,7 @@ def test_keywords_that_are_passed_on_are_explained():
                 assert f"``{p.name}``" in function.__doc__ or f"{p.name}:" in function.__doc__, name
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_type_checker_knows_all_that_is_exported():
     """pyright's own count of complete types, of the names at the doors and of their members."""
     pytest.importorskip("pyright", reason="needs the extra `types`")

@@ -390,7 +390,7 @@ def test_what_cannot_be_sent_is_named(monkeypatch):
             squares(function=lambda s, n, p: np.array(n), executor=executor)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [n for n in CALLS if n not in LATER])
 def test_bad_places_are_named(name, key, tmp_path):
     call, other = CALLS[name], CALLS["monte_carlo" if name == "nominal" else "nominal"]
@@ -578,7 +578,7 @@ def test_killed_calls_go_on_to_the_same_result(name, tmp_path, same, monkeypatch
     assert lasting > 0
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_the_settings_of_the_caller_stay_as_they_are(key):
     """Also when what the threads held is freed."""
     with jax.enable_x64(True):

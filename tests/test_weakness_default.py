@@ -449,7 +449,7 @@ def test_an_outcome_does_not_move_its_own_score(brief):
     assert one.scores[at] == other.scores[at] and not np.array_equal(one.scores, other.scores)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_noise_is_told_apart_by_nobody(brief):
     """Failures that depend on nothing: the scores of what was run are no better than chance."""
     areas = []

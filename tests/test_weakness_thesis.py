@@ -61,7 +61,7 @@ def test_default_widths():
     assert default_widths(1) == (1, 1)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("inputs", "hidden", "widths"),
     [
@@ -138,7 +138,7 @@ def adam(weights, rows, rate, steps):
     return flat
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize(("size", "steps"), [(1, 1), (1, 4), (5, 3)])
 def test_adam_by_hand(key, size, steps):
     rng = np.random.default_rng(1)
@@ -165,7 +165,7 @@ def test_adam_by_hand(key, size, steps):
     assert losses.shape == (steps,) and np.isfinite(losses).all()
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("batch", [1, 3, 7, 10])
 def test_an_epoch_is_every_row_once(key, batch):
     codes, failed = (
@@ -229,7 +229,7 @@ def encoded_digits():
     return result, inputs, labels, predict(inputs) != labels, encoded(result, inputs, labels)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_the_autoencoder_comes_back_from_the_key(encoded_digits):
     """To the weights that made the codes, and the scores that the result ended with."""
     result, inputs, labels, _, networks = encoded_digits
@@ -245,7 +245,7 @@ def test_the_autoencoder_comes_back_from_the_key(encoded_digits):
         encoded(other, inputs, labels)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_the_thesis_figures(encoded_digits):
     result, inputs, _, failed, networks = encoded_digits
     middle = float(np.median(result.scores))
@@ -514,7 +514,7 @@ def test_systems_that_never_or_always_fail(key, rate):
     assert result.expected == rate * (1797 - result.calls)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("n", mark_long([1, 2, 3, 40], 2, 3))
 def test_tables_and_fewer_inputs_than_the_sample(key, n):
     rng = np.random.default_rng(n)
