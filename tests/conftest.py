@@ -41,15 +41,17 @@ that needs the optimised compiler is marked long (soft actor-critic learns NaN w
 
 def pytest_configure(config):
     """Short and slow tests are compiled quickly, the long ones are optimised."""
-    quick = config.option.markexpr in ("not long and not slow", "slow and not long")
-    os.environ.setdefault("XLA_FLAGS", QUICK if quick else OPTIMISED)
+    quick = "not long", "not long and not slow", "slow and not long"
+    os.environ.setdefault("XLA_FLAGS", QUICK if config.option.markexpr in quick else OPTIMISED)
 
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(config, items):
     """What depends on the compiler is long: it runs as users have it, optimised."""
     for item in items:
-        if "equal" in item.fixturenames or item.get_closest_marker("compiled"):
+        if "equal" in item.fixturenames:
+            item.add_marker("compiled")
+        if item.get_closest_marker("compiled"):
             item.add_marker("long")
 
 
