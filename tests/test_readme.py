@@ -70,8 +70,9 @@ def test_the_test_command_is_the_one_that_is_run():
         " pytest"
     )
     assert command in TEXT.splitlines()
-    assert (ROOT / ".ci/run").read_text().splitlines()[-2:] == [
+    assert (ROOT / ".ci/run").read_text().splitlines()[-3:] == [
         command,
+        '.venv/bin/python -m pytest -m "slow and not long"',
         ".venv/bin/python -m pytest -m long",
     ]
 
