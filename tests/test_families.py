@@ -161,19 +161,99 @@ def test_a_mixture_is_exact_in_both_tails(dtype, key):
     assert abs(share - expected) < 4 * np.sqrt(expected / 8000)
 
 
+def _pair(mean):
+    pair = D.Normal(jnp.stack([0.0 * mean, mean]), jnp.asarray([1.0, 0.5]))
+    return D.MixtureSameFamily(D.Categorical(probs=jnp.asarray([0.7, 0.3])), pair)
+
+
 @pytest.mark.long
-def test_derivatives_are_those_of_the_inverse(x64):
-    """By central differences: what is solved by steps has derivatives, too."""
-    pair = D.Normal(jnp.asarray([0.0, 3.0]), jnp.asarray([1.0, 0.5]))
-    mixture = D.MixtureSameFamily(D.Categorical(probs=jnp.asarray([0.7, 0.3])), pair)
-    cut = D.TruncatedNormal(
-        jnp.asarray(0.0), jnp.asarray(1.0), jnp.asarray(-1.0), jnp.asarray(jnp.inf)
+@pytest.mark.parametrize(
+    "make, parameter",
+    [
+        (lambda scale: D.StudentT(3.0, 0.2, scale), 1.3),
+        (_pair, 3.0),
+        (lambda top: D.TruncatedNormal(0.0, 1.0, -1.0, top), jnp.inf),
+        (lambda shape: D.Gamma(shape, 1.0), 2.7),
+        (lambda rate: D.Gamma(2.7, rate), 1.7),
+        (lambda scale: D.Transformed(D.Beta(1.3, 2.7), lambda x: scale * x), 1.7),
+    ],
+)
+def test_derivatives_are_those_of_the_inverse(make, parameter, x64):
+    """By central differences: what is solved by steps has derivatives in z, twice, and in the
+    parameters, forwards and backwards.
+    """
+    at = lambda z, p: D.from_normal(make(p), z)
+    z, p = jnp.asarray([-3.0, 0.3, 2.0]), jnp.asarray(parameter)
+    in_z, in_p = jax.grad(at), jax.grad(at, 1)
+
+    def difference(f, h=1e-5):
+        return (mapped(f, z + h) - mapped(f, z - h)) / (2 * h)
+
+    np.testing.assert_allclose(
+        mapped(lambda z: in_z(z, p), z), difference(lambda z: at(z, p)), rtol=1e-5
     )
-    z = jnp.asarray([-3.0, 0.3, 2.0])
-    for d in (D.StudentT(jnp.asarray(3.0)), mixture, cut):
-        slope = mapped(jax.grad(lambda z, d=d: D.from_normal(d, z)), z)
-        ends = [mapped(lambda z, d=d: D.from_normal(d, z), z + h) for h in (1e-5, -1e-5)]
-        np.testing.assert_allclose(slope, (ends[0] - ends[1]) / 2e-5, rtol=1e-5)
+    np.testing.assert_allclose(
+        mapped(lambda z: jax.jvp(lambda z: in_z(z, p), (z,), (1.0,))[1], z),
+        difference(lambda z: in_z(z, p)),
+        rtol=1e-4,
+        atol=1e-7,
+    )
+    if np.isfinite(parameter):
+        ends = [mapped(lambda z, p=p: at(z, p), z) for p in (parameter + 1e-5, parameter - 1e-5)]
+        np.testing.assert_allclose(
+            mapped(lambda z: in_p(z, p), z), (ends[0] - ends[1]) / 2e-5, 1e-5, 1e-9
+        )
+
+
+SOLVED = "t", "cauchy", "gamma", "gamma below 1", "beta", "beta below 1"
+COUNTED = "poisson", "rare", "binomial"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", SOLVED + COUNTED)
+def test_shapes_that_are_known_need_no_solver(name):
+    """A table serves where they are; what passed through a transformation is solved for, to the
+    same values. Tables are right beyond what the functions of float32 can tell, too.
+    """
+    d, scipys = (floats("float32") | counts("float32"))[name]
+    z = jnp.asarray(np.concatenate([np.linspace(-11, 11, 801), Z]), jnp.float32)
+    by_table = jax.vmap(lambda z: D.from_normal(d, z))
+    by_solver = lambda z: jax.vmap(D.from_normal, (None, 0))(jax.tree.map(jnp.asarray, d), z)
+    for function, solves in ((by_table, False), (by_solver, True)):
+        text = str(jax.make_jaxpr(function)(z))
+        assert ("igamma" in text or "regularized_incomplete_beta" in text) == solves
+    found, middle = np.asarray(jax.jit(by_table)(z)), np.abs(z) < 7
+    solved = np.asarray(jax.jit(by_solver)(z))
+    if name in COUNTED:  # where one number ends and another begins, rounding decides
+        assert np.mean((found != solved)[middle]) < 0.01
+        upper, z = found[z > 0], np.asarray(z[z > 0], float)
+        assert (scipys.sf(upper) <= st.norm.sf(z) * 1.0001).all()
+        assert (scipys.sf(upper - 1) >= st.norm.sf(z) * 0.9999).all()
+        return
+    right = truth(scipys, z)  # near 0, and below the least float, as they are
+    assert (np.abs(found - right) <= 3e-5 * np.abs(right) + 1e-7 * middle + 1e-37).all()
+    np.testing.assert_allclose(found[middle], solved[middle], rtol=2e-4, atol=1e-6)
+    slopes = [
+        jax.jit(jax.vmap(jax.grad(lambda z, f=f: f(z[None])[0])))(z) for f in (by_table, by_solver)
+    ]
+    np.testing.assert_allclose(*(np.asarray(s)[middle] for s in slopes), rtol=3e-3, atol=1e-6)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "d, scipys",
+    [
+        (D.Poisson(0.2), st.poisson(0.2)),
+        (D.Poisson(500.0), st.poisson(500)),
+        (D.Binomial(1000, 0.01), st.binom(1000, 0.01)),
+        (D.Binomial(5, 0.999), st.binom(5, 0.999)),
+        (D.Binomial(0, 0.5), st.binom(0, 0.5)),
+    ],
+)
+def test_counts_are_found_from_far_and_near(d, scipys, x64):
+    """From a guess that is good in the middle, and far off in the tails of few."""
+    k = mapped(lambda z: D.from_normal(jax.tree.map(jnp.float64, d), z), jnp.asarray(Z))
+    np.testing.assert_allclose(k, truth(scipys, Z), atol=1e-9)
 
 
 @pytest.mark.slow

@@ -178,7 +178,7 @@ def _flatten(d: Distribution) -> tuple[list[Any], tuple[Any, ...]]:
     """Arrays (and what JAX puts in their place) are leaves; numbers, shapes, dtypes and functions
     are part of the structure.
     """
-    leaves, treedef = jax.tree.flatten(vars(d))
+    leaves, treedef = jax.tree.flatten({k: v for k, v in vars(d).items() if k != "_known_numbers"})
     data = tuple(_is_data(a) for a in leaves)
     static = tuple(None if own else a for a, own in zip(leaves, data, strict=True))
     return [a for a, own in zip(leaves, data, strict=True) if own], (static, data, treedef)
@@ -201,6 +201,8 @@ class Elementwise(Distribution):
     """Of numbers one by one, by ``_parameters``, names of its attributes, which broadcast."""
 
     event_shape: Any = ()
+    _known_numbers: tuple[float, ...] | None = None
+    """The numbers it was made with, for `tables`; no transformation of JAX keeps them."""
     _parameters: tuple[str, ...]
 
     @property

@@ -14,6 +14,7 @@ from jax.lax import lgamma
 from jast._src.core.typing import Array, ArrayTree, Numeric, PRNGKey
 from jast._src.distributions.base import Elementwise, broadcast, float_array
 from jast._src.distributions.normal import Symmetric
+from jast._src.distributions.tables import numbers
 
 __all__ = ["LOG_2", "Beta", "Gamma", "Laplace", "Logistic", "Uniform"]
 
@@ -127,6 +128,7 @@ class _Pair(Elementwise):
     def __init__(self, a: Numeric, b: Numeric) -> None:
         self._a: jax.Array = float_array(a)
         self._b: jax.Array = float_array(b)
+        self._known_numbers = numbers(a, b)
 
     @property
     def dtype(self) -> Any:

@@ -4,11 +4,14 @@ probabilities below and above, so that rare ones come at the right z in both tai
 
 from __future__ import annotations
 
+import functools
+import math
 from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jax.lax import lgamma
+import numpy as np
+from jax.lax import lgamma, stop_gradient
 from jax.scipy.special import betainc, gammainc, gammaincc
 
 from jast._src.core.typing import Array, Numeric, PRNGKey
@@ -20,13 +23,22 @@ from jast._src.distributions.normal_tails import (
     log_tails,
     normal_of_log_tails,
 )
+from jast._src.distributions.tables import REACH, numbers, serves
 from jast._src.distributions.tilted import Tilted
 
 __all__ = ["Binomial", "Geometric", "Poisson", "TiltedCounts"]
 
 
+MAX_EDGES = 8192
+"""Numbers of a table on either side of the mean at most: 64 kB in a program."""
+SPARE = 64
+"""Numbers beyond so many standard deviations that a table has, as tails of few are long."""
+
+
 class _Counts(Elementwise):
-    """0, 1, 2, ... by one parameter; a subclass says ``log_tails(k)`` and ``top``."""
+    """0, 1, 2, ... by one parameter; a subclass says ``log_tails(k)``, ``top``, and its variance
+    with the third central moment as a share of that.
+    """
 
     _parameters = ("_parameter",)
     _parameter: Any
@@ -39,19 +51,47 @@ class _Counts(Elementwise):
         """(log P(X <= k), log P(X > k)) for whole k >= -1, as floats."""
         raise NotImplementedError
 
+    def _from_normal(self, z):
+        """The number of which z is a normal number: from a table of where each begins, if
+        `tables.serves`.
+        """
+        if (
+            serves(self._known_numbers, z)
+            and (edges := _edges(type(self), self._known_numbers)) is not None
+        ):
+            first, ends = edges
+            return (first + jnp.searchsorted(ends, z)).astype(self.dtype)
+        return self._place(*log_tails(z))
+
+    def _guess(self, z):
+        """About the number of z: Cornish and Fisher 1938, to the second term."""
+        variance, skew = self._variance_and_skew
+        guess = self.mean() + jnp.sqrt(variance) * z + skew * (z**2 - 1) / 6
+        return stop_gradient(jnp.clip(jnp.round(guess), 0, self.top))
+
     def _place(self, below, above):
-        """The least k with P(X <= k) >= exp(below), by whichever of the two is small."""
+        """The least k with P(X <= k) >= exp(below), by whichever of the two is small: from a guess
+        in strides that double, then between two that are known.
+        """
+        below, above, top = map(stop_gradient, (below, above, self.top))
+        top = jnp.broadcast_to(top, jnp.shape(below)).astype(below.dtype)
 
-        def halve(i, bounds):
-            low, high = bounds  # P(X <= low) is too little, P(X <= high) is enough
-            middle = jnp.floor((low + high) / 2)
-            log_below, log_above = self.log_tails(middle)
+        def go_on(carry):
+            low, high, *_ = carry
+            return jnp.any(high - low > 1)
+
+        def narrow(carry):
+            low, high, k, stride = carry  # P(X <= low) is too little, P(X <= high) is enough
+            log_below, log_above = self.log_tails(k)
             enough = jnp.where(below < above, log_below >= below, log_above <= above)
-            return jnp.where(enough, low, middle), jnp.where(enough, middle, high)
+            low, high = jnp.where(enough, low, k), jnp.where(enough, k, high)
+            onward = jnp.where(enough, high - stride, low + stride)
+            k = jnp.where(stride < high - low, onward, jnp.floor((low + high) / 2))
+            return low, high, jnp.clip(k, low, high), 2 * stride
 
-        top = jnp.broadcast_to(self.top, jnp.shape(below)).astype(below.dtype)
-        low, high = jax.lax.fori_loop(0, 32, halve, (jnp.full_like(top, -1), top))
-        return high.astype(self.dtype)
+        k = self._guess(normal_of_log_tails(below, above)).astype(below.dtype)
+        carry = jnp.full_like(top, -1), top, k, jnp.ones_like(top)
+        return jax.lax.while_loop(go_on, narrow, carry)[1].astype(self.dtype)
 
     def log_cell(self, x: Any) -> Array:
         """(log of P(X < x) + p(x) / 2, log of P(X > x) + p(x) / 2): the middle of x's cell."""
@@ -66,6 +106,21 @@ class _Counts(Elementwise):
         k = jnp.asarray(value).astype(self._parameter.dtype)
         whole = (k >= 0) & (k == jnp.floor(k))
         return jnp.where(whole, self._log_p(jnp.where(whole, k, 0)), -jnp.inf)
+
+
+@functools.lru_cache(maxsize=256)
+def _edges(kind, known):
+    """(k, the normal numbers up to which k, k + 1, ... reach); None where they would be many."""
+    from scipy.special import ndtri
+
+    mean, variance = kind._moments(*known)
+    far = REACH * math.sqrt(variance) + SPARE
+    if far > MAX_EDGES:
+        return None
+    k = np.arange(max(math.floor(mean - far), 0), math.ceil(mean + far))
+    below, above = kind._tails(*known, k)
+    with np.errstate(divide="ignore"):
+        return k[0], np.where(below < above, ndtri(below), -ndtri(above)).astype(np.float32)
 
 
 class Geometric(_Counts):
@@ -116,11 +171,25 @@ class Poisson(_Counts):
 
     def __init__(self, rate: Numeric) -> None:
         self.rate: jax.Array = float_array(rate)
-        self._parameter = self.rate
+        self._parameter, self._known_numbers = self.rate, numbers(rate)
 
     @property
     def top(self) -> Any:
         return jnp.ceil(self.rate + 40 * jnp.sqrt(self.rate) + 800)  # beyond every float's z
+
+    @property
+    def _variance_and_skew(self):
+        return self.rate, jnp.ones_like(self.rate)
+
+    @staticmethod
+    def _moments(rate):
+        return rate, rate
+
+    @staticmethod
+    def _tails(rate, k):
+        from scipy import special
+
+        return special.pdtr(k, rate), special.pdtrc(k, rate)
 
     def _sample_n(self, key: PRNGKey, n: int) -> Any:
         return jax.random.poisson(key, self.rate, (n, *self.batch_shape), self.dtype)
@@ -153,11 +222,26 @@ class Binomial(_Counts):
     def __init__(self, total_count: Numeric, probs: Numeric) -> None:
         self.probs: jax.Array = float_array(probs)
         self.total_count: jax.Array = jnp.asarray(total_count, self.probs.dtype)
-        self._parameter = self.probs
+        self._parameter, self._known_numbers = self.probs, numbers(total_count, probs)
 
     @property
     def top(self) -> Any:
         return self.total_count
+
+    @property
+    def _variance_and_skew(self):
+        return self.mean() * (1 - self.probs), 1 - 2 * self.probs
+
+    @staticmethod
+    def _moments(n, p):
+        return n * p, n * p * (1 - p)
+
+    @staticmethod
+    def _tails(n, p, k):
+        from scipy import special
+
+        k = np.minimum(k, n)
+        return special.bdtr(k, int(n), p), special.bdtrc(k, int(n), p)
 
     def _sample_n(self, key: PRNGKey, n: int) -> Any:
         shape = (n, *self.batch_shape)
@@ -229,7 +313,7 @@ for _kind in (Geometric, Poisson, Binomial):
         _kind,
         quantile=lambda d, u: d._place(jnp.log(inside(u)), jnp.log1p(-inside(u))),
         cdf=lambda d, x: jnp.exp(d.log_cell(x)[0]),
-        from_normal=lambda d, z: d._place(*log_tails(z)),
+        from_normal=lambda d, z: d._from_normal(z),
         to_normal=lambda d, x: normal_of_log_tails(*d.log_cell(x)),
         tilt=TiltedCounts,
     )

@@ -5,6 +5,7 @@ small.
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.lax import lgamma
 from jax.scipy.special import betainc, betaln, digamma, gammainc, gammaincc, polygamma
 
@@ -12,12 +13,16 @@ from jast._src.distributions import continuous
 from jast._src.distributions.normal_rows import register_both
 from jast._src.distributions.normal_tails import log_one_less, log_tails, normal_of_log_tails
 from jast._src.distributions.numerically_inverted import newton, row_of_inverse
+from jast._src.distributions.tables import interpolated, serves, tail
 
 __all__ = ["beta_tails", "gamma_tails"]
 
-STEPS = 24  # of Newton's method, which so many bring to rounding
-LIMIT = 4.0  # of one of them
+LEAST = 1e-290  # below it the first term of a series at 0 is exact
 NEAR = -12.0  # the logit below which the first terms of the series at 0 are exact enough
+
+
+def _known(d):
+    return getattr(d, "_known_numbers", None)  # distrax has classes of its own
 
 
 def _sure(below: jax.Array, above: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -43,20 +48,29 @@ def _log_gamma(a, y):
     return a * y - jnp.exp(y) - lgamma(a)
 
 
+def _score_gamma(a, y):
+    return normal_of_log_tails(*gamma_tails(a, y))
+
+
+def _log_of_gamma(a, z):
+    """On the host."""
+    from scipy import special
+
+    p = tail(z)
+    x = np.where(z < 0, special.gammaincinv(a, p), special.gammainccinv(a, p))
+    small = (np.log(p) + special.gammaln(a + 1)) / a  # DLMF 8.7.1
+    return np.where(x > LEAST, np.log(np.maximum(x, LEAST)), small)
+
+
 def _gamma(d, z):
-    a = jnp.broadcast_to(d.concentration, jnp.shape(z)).astype(jnp.result_type(z))
+    known = _known(d)
+    if serves(known, z):
+        return jnp.exp(interpolated(_log_of_gamma, known[:1], z)) / d.rate
+    a = jnp.broadcast_to(d.concentration, jnp.shape(z)).astype(z.dtype)
     cube = 1 - 1 / (9 * a) + z / (3 * jnp.sqrt(a))  # Wilson and Hilferty 1931
     small = (log_tails(z)[0] + lgamma(a + 1)) / a
     guess = jnp.where(cube > 0.3, jnp.log(a) + 3 * jnp.log(jnp.maximum(cube, 0.3)), small)
-    y = newton(
-        z=z,
-        y=guess,
-        score=lambda y: normal_of_log_tails(*gamma_tails(a, y)),
-        log_density=lambda y: _log_gamma(a, y),
-        steps=STEPS,
-        limit=LIMIT,
-    )
-    return jnp.exp(y) / d.rate
+    return jnp.exp(newton(_score_gamma, _log_gamma, a, z, guess)) / d.rate
 
 
 def _tails_gamma(d, x):
@@ -85,8 +99,13 @@ def _first_of_beta(a, b, y):
     )
 
 
-def _log_beta(a, b, y):
+def _log_beta(shapes, y):
+    a, b = shapes
     return -a * jax.nn.softplus(-y) - b * jax.nn.softplus(y) - betaln(a, b)
+
+
+def _score_beta(shapes, y):
+    return normal_of_log_tails(*beta_tails(*shapes, y))
 
 
 def _logit(log_x):
@@ -94,7 +113,21 @@ def _logit(log_x):
     return log_x - jnp.log(-jnp.expm1(log_x))
 
 
-def _logit_beta(d, z):
+def _logit_of_beta(a, b, z):
+    """On the host."""
+    from scipy import special
+
+    p = tail(z)
+    a, b = np.where(z < 0, a, b), np.where(z < 0, b, a)
+    x = special.betaincinv(a, b, p)
+    small = (np.log(p) + np.log(a) + special.betaln(a, b)) / a  # DLMF 8.17.7
+    y = np.where(x > LEAST, special.logit(np.maximum(x, LEAST)), small)
+    return np.where(z < 0, y, -y)
+
+
+def _beta(d, z):
+    if serves(known := _known(d), z):
+        return jax.nn.sigmoid(interpolated(_logit_of_beta, known, z))
     a, b = (jnp.broadcast_to(v, jnp.shape(z)).astype(z.dtype) for v in (d.alpha, d.beta))
     guess = digamma(a) - digamma(b) + jnp.sqrt(polygamma(1, a) + polygamma(1, b)) * z
     # by the first term of the series of the small tail: beyond it for shapes below 1
@@ -103,14 +136,7 @@ def _logit_beta(d, z):
     low = jnp.where(a < 1, jnp.minimum(guess, low), jnp.maximum(guess, low))
     high = jnp.where(b < 1, jnp.maximum(guess, high), jnp.minimum(guess, high))
     guess = jnp.where(z < 0, low, high)
-    return newton(
-        z=z,
-        y=guess,
-        score=lambda y: normal_of_log_tails(*beta_tails(a, b, y)),
-        log_density=lambda y: _log_beta(a, b, y),
-        steps=STEPS,
-        limit=LIMIT,
-    )
+    return jax.nn.sigmoid(newton(_score_beta, _log_beta, (a, b), z, guess))
 
 
 def _tails_beta(d, x):
@@ -119,6 +145,4 @@ def _tails_beta(d, x):
     return beta_tails(d.alpha, d.beta, jnp.log(jnp.minimum(x, 1)) - jnp.log(jnp.minimum(rest, 1)))
 
 
-register_both(
-    continuous.Beta, **row_of_inverse(lambda d, z: jax.nn.sigmoid(_logit_beta(d, z)), _tails_beta)
-)
+register_both(continuous.Beta, **row_of_inverse(_beta, _tails_beta))

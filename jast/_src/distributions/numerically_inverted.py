@@ -6,10 +6,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
+from jax.custom_derivatives import SymbolicZero
 from jax.lax import lgamma, stop_gradient
 from jax.scipy.special import betainc, erfinv
 
@@ -26,34 +29,86 @@ from jast._src.distributions.normal_tails import (
     normal_of_log_tails,
 )
 from jast._src.distributions.operations import from_normal
+from jast._src.distributions.tables import interpolated, numbers, serves, tail
 
 __all__ = ["MixtureSameFamily", "StudentT", "newton", "row_of_inverse"]
 
 
+MAX_STEPS = 64
+"""Steps at most: halving alone brings an interval to rounding."""
+LIMIT = 4.0
+"""Longest step where only one side is known: numbers are logarithms then."""
+
+
 def newton(
+    score: Callable[[Any, jax.Array], jax.Array],
+    log_density: Callable[[Any, jax.Array], jax.Array],
+    about: Any,
     z: jax.Array,
     y: jax.Array,
-    score: Callable[[jax.Array], jax.Array],
-    log_density: Callable[[jax.Array], jax.Array],
-    steps: int,
-    limit: float = 2.0,
+    low: Numeric = -jnp.inf,
+    high: Numeric = jnp.inf,
 ) -> jax.Array:
-    """The y with ``score(y) == z``, from the guess ``y``: steps of at most ``limit``, and one more
-    by which derivatives in z and in what ``score`` closes over are those of the inverse.
+    """The y with ``score(about, y) == z``, from the guess ``y``, by Newton's method between the
+    nearest values known to be too low and too high; to rounding. Its derivatives in z and in
+    ``about`` are those of the inverse.
 
     Args:
-        score: y -> the normal number of the value at y, increasing.
-        log_density: y -> log density of y.
+        score: the normal number of the value at y, increasing.
+        log_density: log density of y.
+        about: a pytree, the parameters of both.
+        z, y: of one shape.
+        low, high: between which the answer lies.
     """
+    leaves, tree = jax.tree.flatten(about)
+    return _newton(score, log_density, tree, leaves, z, y, low, high)
 
-    def step(y):
-        w = score(y)
-        slope = jnp.exp(-0.5 * w**2 - HALF_LOG_2PI - log_density(y))  # dy/dw
-        move = (z - w) * stop_gradient(slope)
-        return y + jnp.clip(jnp.where(jnp.isnan(move), 0, move), -limit, limit)
 
-    y = jax.lax.fori_loop(0, steps, lambda i, y: step(y), stop_gradient(y))
-    return step(stop_gradient(y))
+@partial(jax.custom_jvp, nondiff_argnums=(0, 1, 2))
+def _newton(score, log_density, tree, leaves, z, y, low, high):
+    about, near = tree.unflatten(leaves), math.sqrt(jnp.finfo(z.dtype).eps)
+
+    def go_on(carry):
+        i, *_, far = carry
+        return (i < MAX_STEPS) & jnp.any(far)
+
+    def step(carry):
+        i, y, low, high, far = carry
+        w = score(about, y)
+        move = (z - w) * _slope(log_density, about, w, y)
+        move = jnp.where(jnp.isnan(move), 0, move)
+        low, high = jnp.where(w < z, y, low), jnp.where(w > z, y, high)
+        middle = low + (high - low) / 2
+        last = ~(jnp.abs(z - w) > near)  # from so near one step, which squares the error, is enough
+        inside = (y + move > low) & (y + move < high)
+        between = jnp.where(inside | last, y + move, middle)
+        after = jnp.where(jnp.isfinite(middle), between, y + jnp.clip(move, -LIMIT, LIMIT))
+        return i + 1, jnp.where(far, after, y), low, high, far & ~last
+
+    low, high = (jnp.full_like(y, end) for end in (low, high))
+    return jax.lax.while_loop(go_on, step, (0, y, low, high, jnp.ones(jnp.shape(y), bool)))[1]
+
+
+def _newton_jvp(score, log_density, tree, primals, tangents):
+    leaves, z, *_ = primals
+    (*moves, rise), moved = (*tangents[0], tangents[1]), 0
+    y, about = _newton(score, log_density, tree, *primals), tree.unflatten(leaves)
+    if not all(isinstance(t, SymbolicZero) for t in moves):  # in betainc's shapes there is none
+        moves = list(map(_instantiated, moves))
+        _, moved = jax.jvp(lambda leaves: score(tree.unflatten(leaves), y), (leaves,), (moves,))
+    return y, _slope(log_density, about, z, y) * (_instantiated(rise) - moved)
+
+
+def _slope(log_density, about, z, y):
+    """dy/dz, where the normal number of y is z."""
+    return jnp.exp(-0.5 * jnp.square(z) - HALF_LOG_2PI - log_density(about, y))
+
+
+def _instantiated(tangent):
+    return np.zeros(tangent.shape, tangent.dtype) if isinstance(tangent, SymbolicZero) else tangent
+
+
+_newton.defjvp(_newton_jvp, symbolic_zeros=True)
 
 
 def row_of_inverse(place: Callable[..., Any], known: Callable[..., Any]) -> dict[str, Any]:
@@ -91,6 +146,7 @@ class StudentT(Symmetric):
     def __init__(self, df: Numeric, loc: Numeric = 0.0, scale: Numeric = 1.0) -> None:
         super().__init__(loc, scale)
         self._df = float_array(df)
+        self._known_numbers = numbers(df)
 
     @property
     def dtype(self) -> Any:
@@ -111,27 +167,42 @@ def _log_t(df, t):
 
 def _score_t(df, t):
     """z of |t|: near 0 by the mass between -t and t, farther out by that beyond."""
-    t = jnp.abs(t)
-    share = jnp.square(t) / df
-    middle = betainc(0.5, df / 2, share / (1 + share))
-    beyond = jnp.log(betainc(df / 2, 0.5, 1 / (1 + share)) / 2)
-    near = math.sqrt(2) * erfinv(jnp.minimum(middle, 0.5))
-    return jnp.where(middle < 0.5, near, normal_of_log_tails(jnp.zeros_like(beyond), beyond))
+    square = jnp.square(t)
+    share = square / df
+    near = square < 0.45  # where no more than half lies between, whatever df
+    half, rest = jnp.full_like(share, 0.5), df / 2
+    mass = betainc(
+        jnp.where(near, half, rest),
+        jnp.where(near, rest, half),
+        jnp.where(near, share, 1) / (1 + share),
+    )
+    inner = math.sqrt(2) * erfinv(jnp.where(near, mass, 0))
+    beyond = jnp.log(jnp.where(near, 1, mass) / 2)
+    return jnp.where(near, inner, normal_of_log_tails(jnp.zeros_like(beyond), beyond))
+
+
+def _score_of_asinh(df, y):
+    return _score_t(df, jnp.sinh(y))
+
+
+def _log_of_asinh(df, y):
+    return _log_t(df, jnp.sinh(y)) + jnp.log(jnp.cosh(y))
+
+
+def _asinh_of_t(df, z):
+    """On the host."""
+    from scipy.special import stdtrit
+
+    return -np.sign(z) * np.arcsinh(stdtrit(df, tail(z)))
 
 
 def _student(d, z):
-    df = jnp.broadcast_to(d.df, jnp.shape(z)).astype(jnp.result_type(z))
-    size = jnp.abs(z)
+    if serves(d._known_numbers, z):
+        return d.loc + d.scale * jnp.sinh(interpolated(_asinh_of_t, d._known_numbers, z))
+    size, df = jnp.where(z < 0, -z, z), jnp.broadcast_to(d.df, jnp.shape(z)).astype(z.dtype)
     # a normal number is below the t of its probability, and z rises ever slower in y
-    y = newton(
-        z=size,
-        y=jnp.arcsinh(size),
-        score=lambda y: _score_t(df, jnp.sinh(y)),
-        log_density=lambda y: _log_t(df, jnp.sinh(y)) + jnp.log(jnp.cosh(y)),
-        steps=12,
-        limit=8.0,
-    )
-    return d.loc + d.scale * jnp.sign(z) * jnp.sinh(y)
+    y = newton(_score_of_asinh, _log_of_asinh, df, size, jnp.arcsinh(size))
+    return d.loc + d.scale * jnp.sinh(jnp.where(z < 0, -y, y))
 
 
 def _tails_student(d, x):
@@ -208,24 +279,16 @@ def _tails_mixture(d, x):
     return tuple(jax.nn.logsumexp(t + _log_weights(d), axis=-1) for t in each)
 
 
+def _score_mixture(d, x):
+    return normal_of_log_tails(*_tails_mixture(d, x))
+
+
 def _mixture(d, z):
     parts = d.components_distribution
-
-    def score(x):
-        return normal_of_log_tails(*_tails_mixture(d, x))
-
-    ends = from_normal(parts, jnp.broadcast_to(z[..., None], parts.batch_shape))
-    low, high = stop_gradient(jnp.min(ends, axis=-1)), stop_gradient(jnp.max(ends, axis=-1))
-
-    def halve(i, bounds):
-        low, high = bounds
-        middle = low + (high - low) / 2
-        above = score(middle) > z
-        return jnp.where(above, low, middle), jnp.where(above, middle, high)
-
-    steps = 24 if z.dtype == jnp.float32 else 40
-    low, high = jax.lax.fori_loop(0, steps, halve, (low, high))
-    return newton(z, low + (high - low) / 2, score, d.log_prob, 2, jnp.inf)
+    ends = stop_gradient(from_normal(parts, jnp.broadcast_to(z[..., None], parts.batch_shape)))
+    guess = jnp.sum(ends * jnp.exp(_log_weights(d)), axis=-1)
+    low, high = jnp.min(ends, axis=-1), jnp.max(ends, axis=-1)
+    return newton(_score_mixture, type(d).log_prob, d, z, guess, low, high)
 
 
 register(MixtureSameFamily, **row_of_inverse(_mixture, _tails_mixture))
