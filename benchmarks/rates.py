@@ -6,6 +6,9 @@ with 2,097,152 evaluations (or all with ``--evaluations``), beside a minimal loo
 blocks of vectors of normal numbers by `jax.random.normal`, put through ``step`` and ``evaluate``
 and counted. All were compiled before (the second call of each is timed), and all in this process,
 one after the other. On an accelerator seconds are those of the clock on the wall.
+
+``--families``: what a random number of each family takes in their place, from a normal number,
+where its shape is known before the program is compiled, and where it is not; and to compile.
 """
 
 import warnings
@@ -17,6 +20,7 @@ import jax.numpy as jnp
 from jax import lax
 
 import jast
+import jast.distributions as D
 from benchmarks.closed_loops import JUDGED, RARE, TUNED
 from benchmarks.sizes import add_choices, options, print_report, printer, size
 from jast._src.runtime.device import block_size, read_clock
@@ -28,6 +32,16 @@ SYSTEMS = {a.name: a.simulator for a in (*TUNED, *JUDGED, *RARE) if a.name not i
 WIDEST = 2**17
 """Episodes that the minimal loop runs side by side at most: on a CPU it takes 128."""
 EVALUATIONS = 2**21
+FAMILIES = (
+    D.Normal(0.0, 1.0),
+    D.Laplace(0.0, 1.0),
+    D.StudentT(5.0, 0.0, 1.0),
+    D.Gamma(2.0, 1.0),
+    D.Beta(2.0, 3.0),
+    D.Poisson(4.0),
+    D.Binomial(20, 0.3),
+)
+COLUMNS = "known_us", "solved_us", "known_compile_s", "solved_compile_s"
 METHODS = ("monte_carlo", "failure_probability", "stress")
 
 
@@ -86,24 +100,61 @@ def rates(
     return dict(minimal_loop=alone, **shares)
 
 
+def families(numbers: int, kinds: Sequence[D.Distribution]) -> list[dict[str, float]]:
+    """Of each family microseconds a number, and seconds to compile, by table and solved for."""
+    rows, z = [], jax.random.normal(jax.random.key(0), (numbers // 128, 128))
+    for d in kinds:
+        row, (leaves, tree) = dict(family=type(d).__name__), jax.tree.flatten(d)
+
+        def known(leaves, z, d=d):
+            return D.from_normal(d, z)
+
+        def solved(leaves, z, tree=tree):
+            return D.from_normal(tree.unflatten(leaves), z)
+
+        for name, one in (("known", known), ("solved", solved)):
+            run = jax.jit(lambda p, z, one=one: lax.map(jax.vmap(lambda v: one(p, v)), z))
+            begun = read_clock()
+            run = run.lower(leaves, z).compile()
+            row[f"{name}_compile_s"] = read_clock() - begun
+            jax.block_until_ready(run(leaves, z))
+            begun = read_clock()
+            jax.block_until_ready(run(leaves, z))
+            row[f"{name}_us"] = (read_clock() - begun) / z.size * 1e6
+        rows.append(row)
+    return rows
+
+
 def main(argv: list[str] | None = None) -> None:
     parser = options(__doc__, "three systems")
     add_choices(parser, "--systems", SYSTEMS)
     add_choices(parser, "--methods", METHODS)
     parser.add_argument("--evaluations", type=int, help="of each method")
+    parser.add_argument("--families", action="store_true", help="random numbers, alone")
     args = parser.parse_args(argv)
+    say, numbers, kinds = printer(args), [], size(args, FAMILIES, FAMILIES, FAMILIES[-1:])
+    if args.families or args.smoke:
+        say(f"{'':10s} us a number: known, solved for; compile s: known, solved for")
+        numbers = families(size(args, 2**20, 2**18, 2**10), kinds)
+        for row in numbers:
+            parts = "  ".join(f"{row[k]:8.3f}" for k in COLUMNS)
+            say(f"{row['family']:10s} {parts}")
+        if args.families:
+            return print_report(args, dict(families=numbers))
     names = args.systems or size(args, list(SYSTEMS), ["drone", "grid", "cart-pole"], ["grid"])
     episodes, evaluations = size(args, (2**20, EVALUATIONS), (2**19, EVALUATIONS), (2**12, 2**12))
     if args.evaluations:
         episodes = evaluations = args.evaluations
     methods = args.methods or METHODS
-    say, rows = printer(args), []
+    rows = []
     for name in names:
         with warnings.catch_warnings(action="ignore"):
             rows.append(dict(system=name, **rates(SYSTEMS[name], episodes, evaluations, methods)))
         shares = "  ".join(f"{m} {rows[-1][m]:.3f}" for m in methods)
         say(f"{name:12s} minimal loop {rows[-1]['minimal_loop']:9.0f} a CPU second; {shares}")
-    print_report(args, dict(episodes=episodes, evaluations=evaluations, rows=rows))
+    print_report(
+        args, dict(episodes=episodes, evaluations=evaluations, rows=rows, families=numbers)
+    )
 
 
 if __name__ == "__main__":

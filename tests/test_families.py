@@ -9,6 +9,7 @@ import pytest
 import scipy.stats as st
 from systems import mark_long
 
+import jast
 from jast import distributions as D
 from jast._src.distributions.normal_tails import log_tails, normal_of_log_tails
 
@@ -237,6 +238,39 @@ def test_shapes_that_are_known_need_no_solver(name):
         jax.jit(jax.vmap(jax.grad(lambda z, f=f: f(z[None])[0])))(z) for f in (by_table, by_solver)
     ]
     np.testing.assert_allclose(*(np.asarray(s)[middle] for s in slopes), rtol=3e-3, atol=1e-6)
+
+
+WITHOUT_A_MODE = "gamma below 1", "beta below 1"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "name",
+    mark_long(
+        [n for n in floats("float32") | counts("float32") if n not in WITHOUT_A_MODE],
+        *(n for n in floats("float32") if n not in WITHOUT_A_MODE),
+        "geometric",
+    ),
+)
+def test_every_family_is_a_disturbance(name, key):
+    """Of one step that fails where its number is rare; by populations, whose keys are not
+    Threefry's.
+    """
+    d, scipys = (floats("float32") | counts("float32"))[name]
+    edge = float(scipys.isf(1e-3))
+    sim = jast.Simulator(
+        init=lambda x0: jnp.zeros(()),
+        step=lambda state, x: jnp.asarray(x, jnp.float32),
+        disturbance=lambda state: d,
+        evaluate=lambda state: (state > edge, jnp.maximum(edge - state, 0.0)),
+        horizon=1,
+    )
+    sim = jast.check(sim)
+    found = jast.estimate.population(key, sim, 20_000)
+    # of the tails that SciPy has; HalfNormal is its chi-square's
+    truth = 1e-3 if name in floats("float32") else scipys.sf(edge)
+    assert found.interval[0] / 1.3 < truth < found.interval[1] * 1.3
+    assert jast.estimate.monte_carlo(key, sim, 1000).invalid == 0
 
 
 @pytest.mark.slow

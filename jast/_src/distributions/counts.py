@@ -51,6 +51,12 @@ class _Counts(Elementwise):
         """(log P(X <= k), log P(X > k)) for whole k >= -1, as floats."""
         raise NotImplementedError
 
+    def _sample_n(self, key: PRNGKey, n: int) -> Any:
+        # JAX's own draws of some families are for Threefry's keys alone
+        return self._from_normal(
+            jax.random.normal(key, (n, *self.batch_shape), self._parameter.dtype)
+        )
+
     def _from_normal(self, z):
         """The number of which z is a normal number: from a table of where each begins, if
         `tables.serves`.
@@ -137,10 +143,6 @@ class Geometric(_Counts):
         self.probs: jax.Array = float_array(probs)
         self._parameter = self.probs
 
-    def _sample_n(self, key: PRNGKey, n: int) -> Any:
-        u = jax.random.uniform(key, (n, *self.batch_shape), self.probs.dtype)
-        return self._place(None, jnp.log1p(-u))
-
     def _place(self, below, above):
         k = jnp.ceil(above / jnp.log1p(-self.probs)) - 1
         return jnp.maximum(k, 0).astype(self.dtype)
@@ -191,9 +193,6 @@ class Poisson(_Counts):
 
         return special.pdtr(k, rate), special.pdtrc(k, rate)
 
-    def _sample_n(self, key: PRNGKey, n: int) -> Any:
-        return jax.random.poisson(key, self.rate, (n, *self.batch_shape), self.dtype)
-
     def _log_p(self, k):
         return k * jnp.log(self.rate) - self.rate - lgamma(k + 1)
 
@@ -242,11 +241,6 @@ class Binomial(_Counts):
 
         k = np.minimum(k, n)
         return special.bdtr(k, int(n), p), special.bdtrc(k, int(n), p)
-
-    def _sample_n(self, key: PRNGKey, n: int) -> Any:
-        shape = (n, *self.batch_shape)
-        x = jax.random.binomial(key, self.total_count, self.probs, shape, self.probs.dtype)
-        return x.astype(self.dtype)
 
     def _log_p(self, k):
         n, p = self.total_count, self.probs
