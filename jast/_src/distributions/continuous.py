@@ -16,7 +16,7 @@ from jast._src.distributions.base import Elementwise, broadcast, float_array
 from jast._src.distributions.normal import Symmetric
 from jast._src.distributions.tables import numbers
 
-__all__ = ["LOG_2", "Beta", "Gamma", "Laplace", "Logistic", "Uniform"]
+__all__ = ["LOG_2", "Beta", "Gamma", "Laplace", "Logistic", "Uniform", "log_power"]
 
 LOG_2 = math.log(2.0)
 
@@ -120,6 +120,11 @@ class Uniform(Elementwise):
         return jnp.square(self.range) / 12.0
 
 
+def log_power(x: Array, k: Array) -> Array:
+    """The log of x^k, which is 0 for k = 0 at x = 0, too."""
+    return k * jnp.log(jnp.where((k == 0) & (x == 0), 1, x))
+
+
 class _Pair(Elementwise):
     """Of two positive parameters that broadcast."""
 
@@ -157,7 +162,7 @@ class Gamma(_Pair):
 
     def log_prob(self, value: Any) -> Array:
         a, rate = self._a, self._b
-        return a * jnp.log(rate) + (a - 1) * jnp.log(value) - rate * value - lgamma(a)
+        return a * jnp.log(rate) + log_power(value, a - 1) - rate * value - lgamma(a)
 
     def mean(self) -> Any:
         return self._a / self._b

@@ -77,7 +77,12 @@ def _tails_gamma(d, x):
     return gamma_tails(d.concentration, jnp.log(jnp.maximum(x * d.rate, 0)))
 
 
-register_both(continuous.Gamma, **row_of_inverse(_gamma, _tails_gamma))
+def _mode_of_gamma(d):
+    """The mean where the density has no maximum."""
+    return jnp.where(d.concentration < 1, d.mean(), d.mode())
+
+
+register_both(continuous.Gamma, mode=_mode_of_gamma, **row_of_inverse(_gamma, _tails_gamma))
 
 
 def beta_tails(a: jax.Array, b: jax.Array, y: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -145,4 +150,10 @@ def _tails_beta(d, x):
     return beta_tails(d.alpha, d.beta, jnp.log(jnp.minimum(x, 1)) - jnp.log(jnp.minimum(rest, 1)))
 
 
-register_both(continuous.Beta, **row_of_inverse(_beta, _tails_beta))
+def _mode_of_beta(d):
+    """The mean where the density has no maximum, or is the same everywhere."""
+    a, b = d.alpha, d.beta
+    return jnp.where((a < 1) | (b < 1) | ((a == 1) & (b == 1)), d.mean(), d.mode())
+
+
+register_both(continuous.Beta, mode=_mode_of_beta, **row_of_inverse(_beta, _tails_beta))

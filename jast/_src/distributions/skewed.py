@@ -4,6 +4,7 @@ of the probabilities below and above a value.
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import jax
@@ -11,6 +12,7 @@ import jax.numpy as jnp
 
 from jast._src.core.typing import Array, ArrayTree, Numeric, PRNGKey
 from jast._src.distributions.base import Elementwise, broadcast, float_array
+from jast._src.distributions.continuous import log_power
 from jast._src.distributions.family_table import register
 from jast._src.distributions.log_tail_rows import of_log_tails
 from jast._src.distributions.normal import LocationScale
@@ -161,12 +163,14 @@ class Weibull(Elementwise):
 
     def log_prob(self, value: Any) -> Array:
         k, v = self._shape, value / self._scale
-        inner = jnp.log(k / self._scale) + (k - 1) * jnp.log(jnp.abs(v)) - jnp.abs(v) ** k
+        inner = jnp.log(k / self._scale) + log_power(jnp.abs(v), k - 1) - jnp.abs(v) ** k
         return jnp.where(v < 0, -jnp.inf, inner)
 
     def mode(self) -> Any:
+        """The median where the density has no maximum: for a concentration below 1."""
         k = self.concentration
-        return self.scale * jnp.where(k > 1, jnp.maximum(1 - 1 / k, 0) ** (1 / k), 0.0)
+        power = jnp.where(k < 1, math.log(2.0), jnp.maximum(1 - 1 / k, 0)) ** (1 / k)
+        return self.scale * power
 
 
 def _tails_weibull(d, x):
