@@ -15,6 +15,7 @@ FROZEN = {
     "bernoulli": (0.3,),
     "beta": (2.0, 3.0),
     "binom": (7.0, 0.4),
+    "chi2": (3.0, 0.0, 2.0),
     "expon": (0.0, 2.0),
     "gamma": (1.7, 0.0, 0.5),
     "gumbel_r": (1.0, 2.0),
@@ -66,6 +67,11 @@ def test_shapes_may_come_by_name_and_from_the_state():
     for other in (stats.genextreme(0.1), stats.multivariate_normal([0.0, 0.0])):
         with pytest.raises(ValueError, match=r"no counterpart that JAX can trace.*bernoulli, beta"):
             accepted(other)
+
+
+def test_plain_numbers_of_scipys_need_no_solver():
+    text = str(jax.make_jaxpr(lambda z: D.from_normal(accepted(stats.t(5.0, 1.0, 2.0)), z))(0.3))
+    assert "regularized_incomplete_beta" not in text
 
 
 def walk(disturbance, start=None):

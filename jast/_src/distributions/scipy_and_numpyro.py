@@ -86,13 +86,20 @@ def _of_scipy(d: Any) -> Any:
                 f"scipy.stats.{name}: {parameter} must be {fixed:g} here, received"
                 f" {given[parameter]}: move or stretch its value in step"
             )
-    return OF_SCIPY[name](*(jnp.asarray(given[s]) for s in (*shapes, "loc", "scale")))
+    # plain numbers stay plain: tables serve them
+    return OF_SCIPY[name](
+        *(
+            v if np.ndim(v) == 0 else jnp.asarray(v)
+            for v in map(given.get, (*shapes, "loc", "scale"))
+        )
+    )
 
 
 OF_SCIPY: dict[str, Callable[..., Any]] = {
     "bernoulli": lambda p, loc, scale: discrete.Bernoulli(probs=p),
     "beta": lambda a, b, loc, scale: continuous.Beta(a, b),
     "binom": lambda n, p, loc, scale: counts.Binomial(n, p),
+    "chi2": lambda df, loc, scale: continuous.Gamma(df / 2, 0.5 / scale),
     "expon": lambda loc, scale: skewed.Exponential(1 / scale),
     "gamma": lambda a, loc, scale: continuous.Gamma(a, 1 / scale),
     "gumbel_r": skewed.Gumbel,
@@ -109,7 +116,7 @@ OF_SCIPY: dict[str, Callable[..., Any]] = {
     "weibull_min": lambda c, loc, scale: skewed.Weibull(c, scale),
 }
 """Name -> jast's, of the shape parameters, loc and scale."""
-AT_0 = ("bernoulli", "beta", "binom", "expon", "gamma", "lognorm", "poisson", "weibull_min")
+AT_0 = ("bernoulli", "beta", "binom", "chi2", "expon", "gamma", "lognorm", "poisson", "weibull_min")
 """Those whose support begins at 0."""
 
 
