@@ -267,6 +267,12 @@ def test_every_family_is_a_disturbance(name, key):
     assert jast.estimate.monte_carlo(key, sim, 1000).invalid == 0
 
 
+def test_counts_beyond_what_floats_can_tell_apart():
+    """Neighbours among floats of 1e9 are 64 apart; the search for the number ends all the same."""
+    k = jax.jit(jax.vmap(lambda z: D.from_normal(D.Poisson(1e9), z)))(jnp.asarray([-2.0, 0.0, 3.0]))
+    np.testing.assert_allclose(k, 1e9 + 1e9**0.5 * np.asarray([-2, 0, 3]), atol=2000)
+
+
 @pytest.mark.parametrize("kind", [D.Gamma, D.Weibull])
 def test_a_shape_of_one_is_the_exponential(kind, dtype):
     """At 0, too, where the log of the number is infinite; slopes as well."""

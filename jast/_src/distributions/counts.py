@@ -82,9 +82,12 @@ class _Counts(Elementwise):
         below, above, top = map(stop_gradient, (below, above, self.top))
         top = jnp.broadcast_to(top, jnp.shape(below)).astype(below.dtype)
 
+        def between(low, high):
+            return jnp.floor((low + high) / 2)
+
         def go_on(carry):
-            low, high, *_ = carry
-            return jnp.any(high - low > 1)
+            low, high, *_ = carry  # which may be neighbours among floats, and far apart
+            return jnp.any((between(low, high) > low) & (between(low, high) < high))
 
         def narrow(carry):
             low, high, k, stride = carry  # P(X <= low) is too little, P(X <= high) is enough
@@ -92,7 +95,7 @@ class _Counts(Elementwise):
             enough = jnp.where(below < above, log_below >= below, log_above <= above)
             low, high = jnp.where(enough, low, k), jnp.where(enough, k, high)
             onward = jnp.where(enough, high - stride, low + stride)
-            k = jnp.where(stride < high - low, onward, jnp.floor((low + high) / 2))
+            k = jnp.where(stride < high - low, onward, between(low, high))
             return low, high, jnp.clip(k, low, high), 2 * stride
 
         k = self._guess(normal_of_log_tails(below, above)).astype(below.dtype)
@@ -120,7 +123,7 @@ def _edges(kind, known):
     from scipy.special import ndtri
 
     mean, variance = kind._moments(*known)
-    far = REACH * math.sqrt(variance) + SPARE
+    far = REACH * math.sqrt(max(variance, 0)) + SPARE
     if far > MAX_EDGES:
         return None
     k = np.arange(max(math.floor(mean - far), 0), math.ceil(mean + far))

@@ -6,6 +6,7 @@ has a step in it, and some seconds more to compile. SciPy fills the tables, in d
 from __future__ import annotations
 
 import functools
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -24,10 +25,11 @@ PER_UNIT = 64
 
 
 def numbers(*values: Any) -> tuple[float, ...] | None:
-    """The values as Python's floats, where they are single numbers whose values are known."""
+    """The values as Python's floats, where they are single finite numbers that are known."""
     if is_traced(values) or any(np.ndim(v) for v in values):
         return None
-    return tuple(map(float, values))
+    known = tuple(map(float, values))
+    return known if all(map(math.isfinite, known)) else None
 
 
 def serves(known: tuple[float, ...] | None, z: jax.Array) -> bool:
