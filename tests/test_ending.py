@@ -115,13 +115,27 @@ def test_where_it_is_off(key):
     assert traced.refined is None and traced.failing > 0
 
 
-def test_a_mode_of_infinite_density(key):
-    """Nothing is likelier than anything else there, and so nothing is refined."""
-    infinite = jast.Simulator(
-        SIM.init, SIM.step, lambda s: Weibull(0.5, 1.0), lambda s: (s > 4, jnp.maximum(4 - s, 0)), 2
+class Unbounded(Weibull):
+    """Of a concentration below 1, with its mode where the density is infinite."""
+
+    def mode(self):
+        return jnp.zeros_like(self.scale)
+
+
+@pytest.mark.parametrize("family, refined", [(Unbounded, False), (Weibull, True)])
+def test_a_density_without_a_maximum(family, refined, key):
+    """Where that of the mode is infinite nothing is likelier than anything else, and so nothing is
+    refined. Where a middle stands for the mode failures are.
+    """
+    sim = jast.Simulator(
+        SIM.init, SIM.step, lambda s: family(0.5, 1.0), lambda s: (s > 4, jnp.maximum(4 - s, 0)), 2
     )
-    found = monte_carlo(key, infinite, episodes=500, reward=rewards.STANDARD, refine=0.5)
-    assert found.failing and found.refined is None
+    found = monte_carlo(key, sim, episodes=500, reward=rewards.STANDARD, refine=0.5)
+    assert found.failing
+    assert (found.refined is not None) == refined
+    if refined:
+        best = found.refined.failures.best
+        assert bool(best.failure) and np.isfinite(best.reward)
 
 
 @pytest.mark.long

@@ -86,7 +86,7 @@ def _scaled(
     told = calibration.near, calibration.rare, calibration.likely, calibration.width
     if not is_traced(told):
         if given is None and 2 * int(calibration.tally.invalid) > int(calibration.tally.episodes):
-            # a mode of infinite density, as of a gamma distribution of shape below 1
+            # a mode of infinite density, as a family of the user's own may have
             density, calibration = "raw", calibrate(sim, "raw", widen)
             told = calibration.near, calibration.rare, calibration.likely, calibration.width
         told = [float(v) for v in jax.device_get(told)]
