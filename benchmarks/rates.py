@@ -132,15 +132,15 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--evaluations", type=int, help="of each method")
     parser.add_argument("--families", action="store_true", help="random numbers, alone")
     args = parser.parse_args(argv)
-    say, numbers, kinds = printer(args), [], size(args, FAMILIES, FAMILIES, FAMILIES[-1:])
+    say, by_family, kinds = printer(args), [], size(args, FAMILIES, FAMILIES, FAMILIES[-1:])
     if args.families or args.smoke:
         say(f"{'':10s} us a number: known, solved for; compile s: known, solved for")
-        numbers = families(size(args, 2**20, 2**18, 2**10), kinds)
-        for row in numbers:
+        by_family = families(size(args, 2**20, 2**18, 2**10), kinds)
+        for row in by_family:
             parts = "  ".join(f"{row[k]:8.3f}" for k in COLUMNS)
             say(f"{row['family']:10s} {parts}")
         if args.families:
-            return print_report(args, dict(families=numbers))
+            return print_report(args, dict(families=by_family))
     names = args.systems or size(args, list(SYSTEMS), ["drone", "grid", "cart-pole"], ["grid"])
     episodes, evaluations = size(args, (2**20, EVALUATIONS), (2**19, EVALUATIONS), (2**12, 2**12))
     if args.evaluations:
@@ -153,7 +153,7 @@ def main(argv: list[str] | None = None) -> None:
         shares = "  ".join(f"{m} {rows[-1][m]:.3f}" for m in methods)
         say(f"{name:12s} minimal loop {rows[-1]['minimal_loop']:9.0f} a CPU second; {shares}")
     print_report(
-        args, dict(episodes=episodes, evaluations=evaluations, rows=rows, families=numbers)
+        args, dict(episodes=episodes, evaluations=evaluations, rows=rows, families=by_family)
     )
 
 

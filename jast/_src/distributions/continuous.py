@@ -201,9 +201,7 @@ class Beta(_Pair):
 
     def log_prob(self, value: Any) -> Array:
         a, b = self._a, self._b
-        inner = (a - 1.0) * jnp.log(value) + (b - 1.0) * jnp.log(1.0 - value) - self._norm
-        flat = ((a == 1.0) & (value == 0.0)) | ((b == 1.0) & (value == 1.0))
-        return jnp.where(flat, -self._norm, inner)
+        return log_power(value, a - 1.0) + log_power(1.0 - value, b - 1.0) - self._norm
 
     def mean(self) -> Any:
         return self._a / (self._a + self._b)

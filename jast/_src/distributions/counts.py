@@ -36,8 +36,9 @@ SPARE = 64
 
 
 class _Counts(Elementwise):
-    """0, 1, 2, ... by one parameter; a subclass says ``log_tails(k)``, ``top``, and its variance
-    with the third central moment as a share of that.
+    """0, 1, 2, ... by numbers; a subclass says ``log_tails(k)`` and ``top``; ``_moments`` of its
+    numbers, arrays or floats: mean, variance, and the third central moment as a share of that; and
+    ``_tails`` of floats, on the host.
     """
 
     _parameters = ("_parameter",)
@@ -71,8 +72,8 @@ class _Counts(Elementwise):
 
     def _guess(self, z):
         """About the number of z: Cornish and Fisher 1938, to the second term."""
-        variance, skew = self._variance_and_skew
-        guess = self.mean() + jnp.sqrt(variance) * z + skew * (z**2 - 1) / 6
+        mean, variance, skew = self._moments(*(getattr(self, name) for name in self._parameters))
+        guess = mean + jnp.sqrt(variance) * z + skew * (z**2 - 1) / 6
         return stop_gradient(jnp.clip(jnp.round(guess), 0, self.top))
 
     def _place(self, below, above):
@@ -122,7 +123,7 @@ def _edges(kind, known):
     """(k, the normal numbers up to which k, k + 1, ... reach); None where they would be many."""
     from scipy.special import ndtri
 
-    mean, variance = kind._moments(*known)
+    mean, variance, _ = kind._moments(*known)
     far = REACH * math.sqrt(max(variance, 0)) + SPARE
     if far > MAX_EDGES:
         return None
@@ -182,13 +183,9 @@ class Poisson(_Counts):
     def top(self) -> Any:
         return jnp.ceil(self.rate + 40 * jnp.sqrt(self.rate) + 800)  # beyond every float's z
 
-    @property
-    def _variance_and_skew(self):
-        return self.rate, jnp.ones_like(self.rate)
-
     @staticmethod
     def _moments(rate):
-        return rate, rate
+        return rate, rate, 1
 
     @staticmethod
     def _tails(rate, k):
@@ -230,13 +227,9 @@ class Binomial(_Counts):
     def top(self) -> Any:
         return self.total_count
 
-    @property
-    def _variance_and_skew(self):
-        return self.mean() * (1 - self.probs), 1 - 2 * self.probs
-
     @staticmethod
     def _moments(n, p):
-        return n * p, n * p * (1 - p)
+        return n * p, n * p * (1 - p), 1 - 2 * p
 
     @staticmethod
     def _tails(n, p, k):

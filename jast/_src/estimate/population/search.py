@@ -194,19 +194,20 @@ class PopulationSearch:
         with twice the moves, as the more slowly mixing one may be wrong within its error. Returns
         the kinds that were compared last.
         """
-        while len(kinds) == 2 and kinds[0].way != kinds[1].way:
+        if len(kinds) < 2 or kinds[0].way == kinds[1].way:
+            return kinds
+        while True:
             share = WITNESS_SHARE * self.budget - self.evaluations(kinds[1])
             self.fill(kinds[1], min(share, self.budget - self.spent))
             doubled = tuple(k.doubled for k in kinds)
             cost = self.n * sum(map(self.cost, doubled))
             if self.agree(kinds) or self.spent + cost > self.budget:
-                break
+                return kinds
             for kind in doubled:
                 self.run(kind, 1)
             if any(self.answer(kind) is None for kind in doubled):
-                break
+                return kinds
             kinds = self.sorted_by_cost(doubled)
-        return kinds
 
     def agree(self, kinds):
         """Whether two kinds agree within their errors."""
