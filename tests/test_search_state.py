@@ -71,7 +71,7 @@ def test_a_proposal_promises_what_its_draws_are_worth(family):
     state = searched(family, 3.0, 2.0)
     for mean in (3.0, 2.0, 2.5):
         true = norm.sf(BETA) ** 2 / (np.exp(mean**2) * norm.sf(BETA + mean))
-        said = efficiency(state, failure_log_ratios(family, at(family, mean), state.batches))
+        said = efficiency(state, failure_log_ratios(family, state, at(family, mean)))
         assert said == pytest.approx(true, rel=0.1)
     assert state.q is state.batches[0].q
     assert is_efficient(state, 0.2) and not is_efficient(state, 0.5)

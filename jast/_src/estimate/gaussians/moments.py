@@ -206,5 +206,5 @@ def _fit_batches(f, state, planes):
         z = np.concatenate([b.points.z for b in state.batches])
         layers = fit_layers(z, state.log_weight, planes, first)
     q = layers_as_latent(planes, layers, f.dtype)
-    fitted = efficiency(state, failure_log_ratios(f, q, state.batches))
+    fitted = efficiency(state, failure_log_ratios(f, state, q))
     return state._replace(q=q, efficiency=fitted) if fitted > state.efficiency else state

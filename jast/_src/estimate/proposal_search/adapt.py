@@ -7,6 +7,7 @@ from __future__ import annotations
 from jast._src.estimate.gaussians.mixture_fit import effective_sample_size
 from jast._src.estimate.proposal_search.search_state import (
     Family,
+    Scored,
     SearchState,
     add_batch,
     efficiency,
@@ -50,9 +51,7 @@ def refit(family: Family, state: SearchState) -> tuple[SearchState, object, str]
     has, or one of those that the family fits to them; that proposal, and its name.
     """
     choices = {"as it was": state.q, **family.refit(state)}
-    each = {
-        name: efficiency(state, failure_log_ratios(family, q, state.batches))
-        for name, q in choices.items()
-    }
-    name = max(each, key=each.get)
-    return state._replace(q=choices[name]), choices[name], name
+    scored = {name: Scored(q, failure_log_ratios(family, state, q)) for name, q in choices.items()}
+    name = max(scored, key=lambda name: efficiency(state, scored[name].log_ratio))
+    q = choices[name]
+    return state._replace(q=q, scored=(*state.scored, scored[name])), q, name

@@ -260,7 +260,7 @@ def _check_uncovered_share(family, state):
     """The state with a reason where much of the probability lies, by the batches, where the
     proposal hardly draws, and few draws tell of it.
     """
-    rows = failure_log_ratios(family, state.q, state.batches) < _coverage_threshold(family, state)
+    rows = failure_log_ratios(family, state, state.q) < _coverage_threshold(family, state)
     w = np.exp(state.log_weight - state.log_weight.max())
     share = w[rows].sum() / w.sum()
     settings = family.settings

@@ -22,6 +22,7 @@ from jast._src.estimate.proposal_search.settings import SearchSettings
 __all__ = [
     "Batch",
     "Family",
+    "Scored",
     "SearchContext",
     "SearchState",
     "add_batch",
@@ -49,14 +50,22 @@ class Batch(NamedTuple):
     invalid: int = 0
 
 
+class Scored(NamedTuple):
+    """A proposal, and what it makes of the failures of all batches."""
+
+    q: Any
+    log_ratio: np.ndarray
+    """[N] log q - log p"""
+
+
 class SearchState(NamedTuple):
     """What a search knows."""
 
     q: Any = None
     """The best proposal so far, of its `Family`; None before any failure"""
     batches: tuple[Batch, ...] = ()
-    ratios: tuple[np.ndarray, ...] = ()
-    """Of batch j: log q_i - log p [i, m] of its failing points by the proposal of each batch i"""
+    scored: tuple[Scored, ...] = ()
+    """The proposals that have drawn the batches, each once, and the one that was fitted last"""
     log_weight: np.ndarray = np.zeros(0)
     """Of the failing points of all batches, by the balance heuristic"""
     log_mean: float = -math.inf
@@ -180,22 +189,20 @@ def add_batch(family: Family, state: SearchState, batch: Batch) -> SearchState:
     """The state with one more `Batch`: the weights of all failures, the probability by them, and
     of the proposals that have drawn the most efficient one.
     """
-    old = zip(state.ratios, state.batches, strict=True)
-    ratios = [np.vstack([r, family.log_ratio(batch.q, b.points)]) for r, b in old]
-    before = [family.log_ratio(b.q, batch.points) for b in state.batches]
-    ratios.append(np.vstack([*before, -batch.log_weight]))
     batches = (*state.batches, batch)
-    over = np.concatenate(ratios, axis=1)  # [I, N]
-    total = sum(b.size for b in batches)
-    share = np.log([b.size / total for b in batches])
-    log_w = -np.logaddexp.reduce(over + share[:, None], axis=0)
-    new = state._replace(batches=batches, ratios=tuple(ratios))
+    scored = []
+    for q in _distinct(batches):
+        new = -batch.log_weight if q is batch.q else family.log_ratio(q, batch.points)
+        scored.append(Scored(q, np.concatenate([failure_log_ratios(family, state, q), new])))
+    new = state._replace(batches=batches, scored=tuple(scored))
+    over = np.stack([s.log_ratio for s in scored]) + _log_shares(new)[:, None]
+    log_w = -np.logaddexp.reduce(over, axis=0)
     if len(log_w):
-        log_mean = float(np.logaddexp.reduce(log_w) - math.log(total))
+        log_mean = float(np.logaddexp.reduce(log_w) - math.log(new.size))
         new = new._replace(log_weight=log_w, log_mean=log_mean)
-        each = [efficiency(new, r) for r in over]
+        each = [efficiency(new, s.log_ratio) for s in scored]
         best = int(np.argmax(each))
-        new = new._replace(q=batches[best].q, efficiency=each[best])
+        new = new._replace(q=scored[best].q, efficiency=each[best])
     family.context.latest[:] = [(family, new._replace(spent=state.spent + family.batch))]
     return new
 
@@ -208,17 +215,32 @@ def efficiency(state: SearchState, log_ratio: np.ndarray) -> float:
     return math.exp(min(2 * state.log_mean - second, 0.0))
 
 
-def failure_log_ratios(family: Family, q: Any, batches: Sequence[Batch]) -> np.ndarray:
-    """log q - log p of the failing points of all ``batches``."""
-    return np.concatenate(
-        [-b.log_weight if b.q is q else family.log_ratio(q, b.points) for b in batches]
-    )
+def failure_log_ratios(family: Family, state: SearchState, q: Any) -> np.ndarray:
+    """log q - log p [N] of the failing points of all batches; computed once where the state holds
+    ``q``.
+    """
+    for s in state.scored:
+        if s.q is q:
+            return s.log_ratio
+    each = [-b.log_weight if b.q is q else family.log_ratio(q, b.points) for b in state.batches]
+    return np.concatenate([*each, np.zeros(0)])
 
 
 def pooled_log_ratio(family: Family, state: SearchState, points: Any) -> np.ndarray:
     """log q - log p [m] of ``points``, q being the mixture of the proposals of all batches."""
-    each = [family.log_ratio(b.q, points) + math.log(b.size / state.size) for b in state.batches]
-    return np.logaddexp.reduce(each)
+    each = [family.log_ratio(q, points) for q in _distinct(state.batches)]
+    return np.logaddexp.reduce(np.stack(each) + _log_shares(state)[:, None])
+
+
+def _distinct(batches):
+    """The proposals of the batches, each once."""
+    return tuple({id(b.q): b.q for b in batches}.values())
+
+
+def _log_shares(state):
+    """Logs of the shares of all episodes that each of the `_distinct` proposals has drawn."""
+    sizes = [sum(b.size for b in state.batches if b.q is q) for q in _distinct(state.batches)]
+    return np.log(sizes) - math.log(state.size)
 
 
 def is_efficient(state: SearchState, least: float) -> bool:

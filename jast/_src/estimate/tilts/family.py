@@ -210,7 +210,8 @@ class TiltFamily(NamedTuple):
         return r / r.sum(axis=1, keepdims=True)
 
     def _joint(self, q, points):
-        rows = steps_of(self.about, q.frame, *points)
+        # as the program that draws them: half the time of double precision, or less
+        rows = steps_of(self.about, q.frame, *points, normal_numbers(self.sim))
         with np.errstate(divide="ignore"):
             return log_ratios(q.tilts, rows, len(points.length)) + np.log(q.weights)[None]
 

@@ -133,24 +133,27 @@ def _live_steps(trace, length):
     return at, t
 
 
-def steps_of(about: Shape, frame: Frame, trace: Trace, length: np.ndarray) -> tuple[Rows, Rows]:
-    """The `Rows` of x0 and of the steps of traces of these lengths."""
+def steps_of(
+    about: Shape, frame: Frame, trace: Trace, length: np.ndarray, dtype: DTypeLike = np.float64
+) -> tuple[Rows, Rows]:
+    """The `Rows` of x0 and of the steps of traces of these lengths, in so many bits."""
     n, (at, t) = len(length), _live_steps(trace, length)
-    x = features(frame, trace.seen[at, t].astype(np.float64), t / trace.seen.shape[1], np)
-    first = np.ones((n, 1)), np.arange(n), *trace[:3]
+    frame, tau = Frame(*(a.astype(dtype) for a in frame)), (t / trace.seen.shape[1]).astype(dtype)
+    x = features(frame, trace.seen[at, t].astype(dtype), tau, np)
+    first = np.ones((n, 1), dtype), np.arange(n), *trace[:3]
     steps = x, at, *(a[at, t] for a in (trace.normals, trace.choices, trace.log_p))
     return _rows(about.owners0, *first), _rows(about.owners, *steps)
 
 
 def _rows(owners, x, trace, normals, choices, log_p):
-    log_p = log_p.astype(np.float64)
+    log_p = log_p.astype(x.dtype)
     rare = count_rare_before(log_p, choices, np) if choices.shape[1] else np.zeros(choices.shape)
     none = np.zeros((len(x), 1), choices.dtype)
     own = np.concatenate([choices, none], axis=1)[:, np.asarray(owners, int)]
     return Rows(
         x=x,
         trace=trace,
-        normals=normals.astype(np.float64),
+        normals=normals.astype(x.dtype),
         choices=choices,
         log_p=log_p,
         rare=rare,
@@ -317,7 +320,10 @@ def _fit_log_odds(x, target, log_p, w, ridge, start=None):
 
 
 def log_ratios(tilts: list[Tilt], rows: tuple[Rows, Rows], n: int) -> np.ndarray:
-    """log q_k - log p [n, K] of ``n`` traces under each of ``tilts``."""
+    """log q_k - log p [n, K] of ``n`` traces under each of ``tilts``; of each step in the precision
+    of its `Rows`, summed in double.
+    """
+    tilts = jax.tree.map(lambda a: np.asarray(a, rows[1].x.dtype), tilts)
     return np.stack(
         [
             sum(
@@ -332,10 +338,10 @@ def log_ratios(tilts: list[Tilt], rows: tuple[Rows, Rows], n: int) -> np.ndarray
 
 def _log_ratio(block, rows, floor):
     """log q - log p [N] of each row."""
-    out = np.zeros(len(rows.x))
+    out = np.zeros(len(rows.x), rows.x.dtype)
     for a in range(rows.normals.shape[1]):
         for c in range(block.means.shape[1]):
-            mine = rows.own[:, a] == c
+            mine = rows.own[:, a] == c if block.means.shape[1] > 1 else slice(None)
             x, z, gates = rows.x[mine], rows.normals[mine, a], block.gates[:, c, a]
             of = block.means[:, c, a], gates, block.scales[c, a]
             out[mine] += log_sum(_joint(x, z, *of)) - log_sum(x @ gates)
