@@ -11,7 +11,7 @@ import numpy as np
 
 from jast._src.core.counter_prng import numpy_generator
 from jast._src.core.simulator import Simulator
-from jast._src.estimate.estimate import Estimate, times_too_few
+from jast._src.estimate.estimate import MAX_RELATIVE_ERROR, Estimate, times_too_few
 from jast._src.estimate.population.population import episodes_a_second
 from jast._src.normal_space import transform
 from jast._src.normal_space.evaluate_points import evaluate_points
@@ -32,17 +32,22 @@ MIN_POPULATION_BUDGET = 300_000
 """Evaluations from which populations answer rather than a proposal. Of the drone, the grid and the
 crossing of `benchmarks.closed_loops` they have standard errors of 12 to 16 % with 100,000 and of 6
 to 8 % with 300,000; a proposal of tilts has 1 % of the drone with 100,000."""
+MAX_POPULATION_SECONDS = 24.0
+"""CPU seconds of simulation up to which a call by default has `MIN_POPULATION_BUDGET` of them: a
+proposal of tilts takes TILTSECONDS of its own, however few the evaluations."""
 MAX_DEFAULT_BUDGET = 2**25
 """Evaluations by default at most: static problems of few numbers are then answered within 3 % down
 to 1e-9, in seconds."""
 DEFAULT_BUDGET = 100_000
 """Evaluations by default of a system that does not simulate `MIN_POPULATION_BUDGET` in
-`DEFAULT_SECONDS`."""
+`MAX_POPULATION_SECONDS`."""
 STEADY_BUDGET = 2**22
-"""Evaluations with which a call by default is made again where its first answer is UNRELIABLE by
-its standard error alone and these would do: so the verdict follows from the system, not from how
-busy the machine was. The landing of `benchmarks.closed_loops` needs 2.3 million, and was given 1.
-"""
+"""Evaluations at most with which a call by default is made again where its first answer is
+UNRELIABLE by its standard error alone and these would do: so the verdict follows from the system,
+not from how busy the machine was. The landing of `benchmarks.closed_loops` needs 2.3 million, and
+was given 1."""
+PLAIN_SHARE = 2 / 3
+"""Share of a budget that plain draws have where they are best: two populations were first."""
 TIMED_SECONDS = 0.2
 """Seconds of the runs by which the rate of a black box is measured."""
 MAX_TIMED_RUNS = 1024
@@ -73,8 +78,11 @@ def measure_budget(
     if seconds is None:
         if runs_on_host(sim):
             return default
-        budget = _round_down(DEFAULT_SECONDS * episodes_a_second(key, sim))
-        return default if budget < MIN_POPULATION_BUDGET else min(budget, MAX_DEFAULT_BUDGET)
+        rate = episodes_a_second(key, sim)
+        if rate * MAX_POPULATION_SECONDS < MIN_POPULATION_BUDGET:
+            return default
+        budget = min(_round_down(DEFAULT_SECONDS * rate), MAX_DEFAULT_BUDGET)
+        return max(budget, MIN_POPULATION_BUDGET)
     real = isinstance(seconds, int | float | np.number) and not isinstance(seconds, bool)
     if not real or not 0 < float(seconds) < math.inf:
         raise ValueError(f"{name}: seconds must be a number above 0, received {seconds!r}")
@@ -87,7 +95,14 @@ def next_budget(found: Estimate, budget: int) -> int | None:
     it is not.
     """
     times = times_too_few(found)
-    return STEADY_BUDGET if 1 < times and times * budget <= STEADY_BUDGET else None
+    if times <= 1:
+        return None
+    plain = 1 / (MAX_RELATIVE_ERROR**2 * found.mean * PLAIN_SHARE)
+    enough = max(min(times * budget, plain), budget)
+    if enough > STEADY_BUDGET:
+        return None
+    # 1.3 to 2 times as many, for a standard error is itself an estimate
+    return min(2 * _round_down(enough), STEADY_BUDGET)
 
 
 def check_budget_or_seconds(name: str, budget: Any, seconds: Any) -> None:

@@ -16,6 +16,7 @@ from jast._src.util.intervals import checked_level, chernoff, clopper_pearson, j
 
 __all__ = [
     "MAX_INVALID_SHARE",
+    "MAX_RELATIVE_ERROR",
     "Estimate",
     "estimate_from_counts",
     "estimate_from_mean",

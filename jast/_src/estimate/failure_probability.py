@@ -64,8 +64,8 @@ def failure_probability(
 ) -> Estimate:
     """The probability that a system fails, by the way that suits what an episode costs.
 
-    By default the rate of the system is measured. One that simulates 300,000 episodes in some eight
-    CPU seconds is answered by populations that stay on the device (`population`), and so is every
+    By default the rate of the system is measured. One that simulates 300,000 episodes in 24 CPU
+    seconds is answered by populations that stay on the device (`population`), and so is every
     system in JAX with a budget from 300,000 on. ``settings`` names the budget that was used: the
     same key with that budget gives the same bits. The others, and calls with ``failures`` or
     ``near``, are answered by a proposal that this function finds itself.
@@ -125,10 +125,10 @@ def failure_probability(
     Args:
         key: consumed.
         sim: the simulator; its disturbances have quantile functions.
-        budget: episodes to simulate, at least 50. Default: what a cheap system simulates in some
-            eight CPU seconds, at most 33,554,432; 100,000 of others. Where only the standard error
-            of that answer makes it UNRELIABLE, and 4,194,304 would do, it is made again with these
-            (but not with a ``checkpoint``).
+        budget: episodes to simulate, at least 50. Default: what the system simulates in some eight
+            CPU seconds, from 300,000 to 33,554,432; 100,000 where 300,000 take more than 24. Where
+            only the standard error of an answer by populations makes it UNRELIABLE, and 4,194,304
+            would do, it is made again with as many as it needs (but not with a ``checkpoint``).
         seconds: in place of ``budget``: as many episodes as the system simulates in so many CPU
             seconds (a black box: seconds), rounded down to 2^k or 3 2^k. Compilation and the
             method's own work come on top.

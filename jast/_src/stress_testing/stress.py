@@ -151,7 +151,7 @@ def stress(
     """How does the system fail, how likely, and what is its likeliest failure?
 
     It checks the simulator, and runs it undisturbed and under plain draws. By default its rate is
-    then measured. A system that simulates 300,000 episodes in some eight CPU seconds is answered by
+    then measured. A system that simulates 300,000 episodes in 24 CPU seconds is answered by
     populations that stay on the device (`jast.estimate.population`): they tell the probability,
     their failures are cooled to the likeliest near to each, pulled to where log p is greatest
     (`jast.search.refine`), and sorted into failure modes, each with its share of the probability.
@@ -167,11 +167,12 @@ def stress(
         sim: the simulator.
         budget: evaluations (episodes; one with its gradient counts as 3 or 4) in all, nearly; of
             a black box its runs, never more, with all that the call runs; at least 300. Default:
-            what a cheap system simulates in some eight CPU seconds, at most 33,554,432; 200,000 of
-            others. Where only the standard error of the probability makes it UNRELIABLE, and
-            4,194,304 would do, everything is done again with these (but not with a
-            ``checkpoint``). The report's ``settings`` name the one that was used.
-            Below 10,417 the probability is that of `failure_probability` with few calls.
+            what the system simulates in some eight CPU seconds, from 300,000 to 33,554,432; 200,000
+            where 300,000 take more than 24. Where only the standard error of a probability by
+            populations makes it UNRELIABLE, and 4,194,304 would do, everything is done again with
+            as many as it needs (but not with a ``checkpoint``). The report's ``settings`` name the
+            one that was used. Below 10,417 the probability is that of `failure_probability` with
+            few calls.
         seconds: in place of ``budget``: as many evaluations as the system simulates in so many CPU
             seconds (a black box: seconds), rounded down to 2^k or 3 2^k.
         top: failures kept, at least one for each mode.
@@ -341,7 +342,7 @@ class _StressTest:
         self.keep_probability(p, "populations")
         sample = p.proposal
         if not isinstance(sample, Sample):
-            # nothing leads to failures, or all does
+            # nothing leads to failures
             self.parts = BudgetShares(nominal=0, search=refining, slow_search=0, refine=refining)
             if not len(self.pool):
                 self.search()

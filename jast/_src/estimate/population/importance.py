@@ -28,7 +28,7 @@ from jast._src.normal_space.transform import Latent, dimension, normal_numbers
 from jast._src.runtime.device import BLOCK
 from jast._src.runtime.progress_bar import Watch
 
-__all__ = ["importance_estimate"]
+__all__ = ["gaussians_promise_more", "importance_estimate"]
 
 TARGET_ERROR = 0.005
 """Relative standard error at which it ends: no population checks a smaller one."""
@@ -67,13 +67,7 @@ def importance_estimate(
     left = (search.budget - search.spent) * PILOT_DIVISOR // (PILOT_DIVISOR + 1)
     if left < BLOCK:
         return None
-    copies = 2  # of each component there is a wide copy
-    affordable = MAX_PRODUCTS / (copies * PLANNED_DRAWS * dimension(search.sim) ** 2)
-    several = max(int(min(affordable, MAX_COMPONENTS)), 1)
-    samples = [sample_from(search.runs[k]) for k in kinds]
-    log_mean = pool_answers([search.answer(k) for k in kinds]).log_mean
-    fitted = [_fit_proposal(search, samples, log_mean, left, k) for k in sorted({1, several})]
-    best = min(fitted, key=lambda proposal: proposal.relative)
+    best = _best_proposal(search, kinds, left)
     by_populations = search.answer(kinds[0]).relative  # and what they promise with the rest
     if best.relative > by_populations / math.sqrt(1 + left / search.evaluations(kinds[0])):
         return None
@@ -93,6 +87,25 @@ def importance_estimate(
         reason = "; ".join(found.warnings)
     search.history.append(f"which is not used: {reason}")
     return None
+
+
+def gaussians_promise_more(search: PopulationSearch) -> bool:
+    """Whether Gaussians fitted to the failures so far promise more than plain draws of what is left
+    of the budget.
+    """
+    best = _best_proposal(search, search.reached(), search.budget - search.spent)
+    return best.relative < search.plain_error()
+
+
+def _best_proposal(search, kinds, left):
+    """The `FittedProposal` of one or of several Gaussians that promises more."""
+    copies = 2  # of each component there is a wide copy
+    affordable = MAX_PRODUCTS / (copies * PLANNED_DRAWS * dimension(search.sim) ** 2)
+    several = max(int(min(affordable, MAX_COMPONENTS)), 1)
+    samples = [sample_from(search.runs[k]) for k in kinds]
+    log_mean = pool_answers([search.answer(k) for k in kinds]).log_mean
+    fitted = [_fit_proposal(search, samples, log_mean, left, k) for k in sorted({1, several})]
+    return min(fitted, key=lambda proposal: proposal.relative)
 
 
 def _fit_proposal(search, samples, log_mean, left, components):

@@ -18,7 +18,7 @@ from jast._src.estimate.population.answer import (
     estimate_from_populations,
 )
 from jast._src.estimate.population.descents import population_size
-from jast._src.estimate.population.importance import importance_estimate
+from jast._src.estimate.population.importance import gaussians_promise_more, importance_estimate
 from jast._src.estimate.population.particle_moves import allocate_particles, draw_particles
 from jast._src.estimate.population.search import PopulationSearch
 from jast._src.normal_space import transform
@@ -75,7 +75,8 @@ def population(
     failures, its moves are doubled until its answer stays. The model's own draws,
     with which each population begins, are a third witness. Otherwise the estimate is UNRELIABLE and
     says which way saw what; so it is with a relative standard error above 5 %, and with coarse
-    floats. Where plain draws tell the probability soonest, it draws plainly.
+    floats. Where plain draws promise more than these, and enough for an answer, it draws
+    plainly.
 
     A failure mode that no way meets is missing without a sign. A KeyboardInterrupt ends it with the
     estimate of the populations that are done, and is raised where there is none. Host loop, not for
@@ -176,15 +177,18 @@ def by_populations(
             key, sim, budget, n=n, capacity=capacity, watch=watch, placement=placement
         )
         search.run(search.first_kind("distance"), 1)
-        plain = search.plain_is_best()
+        plain = search.failures_are_frequent()
         if not plain:
             search.run(search.first_kind("width"), 1)
+            plain = search.plain_answers() and not gaussians_promise_more(search)
         kinds, by_weights = () if plain else search.choose_kinds(), None
-        if not kinds:  # plain draws are all that tells the probability
+        if kinds:
+            kinds = search.compare(kinds)
+            if len(kinds) == 2 and not search.interrupted:
+                by_weights = importance_estimate(search, name, kinds, level)
+            plain = by_weights is None and search.plain_answers()
+        if plain or not kinds:
             return estimate_from_plain_draws(search, name, level)
-        kinds = search.compare(kinds)
-        if len(kinds) == 2 and not search.interrupted:
-            by_weights = importance_estimate(search, name, kinds, level)
         if by_weights is None:
             search.fill(kinds[0], search.budget - search.spent)
         else:

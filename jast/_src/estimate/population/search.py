@@ -12,7 +12,7 @@ import jax
 import numpy as np
 
 from jast._src.core.float_resolution import rounding_problem
-from jast._src.estimate.estimate import MAX_INVALID_SHARE
+from jast._src.estimate.estimate import MAX_INVALID_SHARE, MAX_RELATIVE_ERROR
 from jast._src.estimate.population.descents import DESCENTS, SETTINGS, Descent
 from jast._src.runtime import work as units
 from jast._src.runtime.backends import Task
@@ -158,11 +158,29 @@ class PopulationSearch:
         cost = self.answer(kind).relative ** 2 * self.cost(kind) * self.n
         return math.sqrt(cost / (WITNESS_SHARE * self.budget))
 
-    def plain_is_best(self):
-        """Whether plain draws alone tell the probability."""
+    def failures_are_frequent(self):
+        """Whether plain draws meet enough of them."""
         failing, _, drawn = self.plain
         expected = failing / drawn * (self.budget - self.spent)
         return failing >= MIN_PLAIN_FAILURES and expected >= ENOUGH_PLAIN_FAILURES
+
+    def reached(self):
+        """The kinds so far that reached failures, the more exact for its cost first."""
+        return self.sorted_by_cost(k for k in self.runs if self.answer(k) is not None)
+
+    def plain_error(self):
+        """The relative standard error of plain draws of what is left of the budget, by the most
+        exact of the kinds that reached failures.
+        """
+        expected = math.exp(self.answer(self.reached()[0]).log_mean) * (self.budget - self.spent)
+        return expected**-0.5 if expected > 0 else math.inf
+
+    def plain_answers(self):
+        """Whether plain draws answer, and more exactly than the populations so far promise to."""
+        if self.interrupted or not self.reached():
+            return False
+        promised = self.expected_error(self.reached()[0]) * math.sqrt(WITNESS_SHARE)  # with all
+        return self.plain_error() <= min(promised, MAX_RELATIVE_ERROR)
 
     def choose_kinds(self):
         """The two kinds that are to agree, the more exact for its cost first; one where there is
