@@ -468,7 +468,7 @@ def test_a_cheap_system_is_answered_by_populations_and_names_its_budget(key, mon
     [
         (0.07, 1e-9, None, [3 * 2**17, 2**20]),
         (0.15, 1e-9, None, [3 * 2**17, 2**22]),
-        (0.15, 1e-3, None, [3 * 2**17, 2**20]),
+        (0.15, 1e-3, None, [3 * 2**17, 2**20, 2**21, 2**22]),
         (0.2, 1e-9, None, [3 * 2**17]),
         (0.07, 1e-9, 400_000, [400_000]),
     ],
@@ -477,8 +477,9 @@ def test_a_default_call_is_made_again_where_a_known_budget_would_do(
     error, mean, given, budgets_used, two, key, monkeypatch
 ):
     """A first error of 7 % needs 771,000, so that 2^20 have some reserve; one of 15 % needs 3.5
-    million, and has 2^22, or 600,000 where plain draws of two thirds of them tell as much; one of
-    20 % needs more than 2^22. What was asked for is not changed.
+    million, and has 2^22, or first 2^20 where plain draws of two thirds of 600,000 would tell as
+    much (none of these draws plainly); one of 20 % needs more than 2^22. What was asked for is not
+    changed.
     """
     called = []
 
@@ -493,7 +494,7 @@ def test_a_default_call_is_made_again_where_a_known_budget_would_do(
     monkeypatch.setattr(module, "by_populations", answer_with)
     found = failure_probability(key, SIDES, given)
     assert called == budgets_used and found.settings["budget"] == called[-1]
-    assert found.reliable == (len(called) == 2 and mean < 1e-3)  # none of these draws plainly
+    assert found.reliable == (len(called) > 1)
 
 
 def test_seconds_of_a_black_box_are_of_the_clock(key):

@@ -223,10 +223,10 @@ def failure_probability(
             )
             found = estimate_by_proposal(wanted)
             found = flag_imprecise(found) if budget >= MIN_BUDGET else found
-    more = budgets.next_budget(found, budget) if by_default and not few else None
-    if more is not None:
+    found = found._replace(settings=settings)
+    while by_default and not few and (budget := budgets.next_budget(found, budget)) is not None:
         again = failure_probability(
-            *(key, sim, more),
+            *(key, sim, budget),
             gradients=gradients,
             level=level,
             progress=progress,
@@ -235,8 +235,8 @@ def failure_probability(
             devices=devices,
         )
         said = f"{found.evaluations} evaluations were too few: {found.relative_error:.1%}"
-        return again._replace(history=(said, *again.history))
-    return found._replace(settings=settings)
+        found = again._replace(history=(said, *again.history))
+    return found
 
 
 def adaptive_cross_entropy(

@@ -242,11 +242,12 @@ def stress(
                 raise
             settings["interrupted"] = f"after {test.spent} of {budget} evaluations"
         report = test.report(settings)
-    if by_default and test.cheap and "interrupted" not in settings:
-        more = budgets.next_budget(report.probability, budget)
-        if more is not None:
-            places = dict(executor=executor, devices=devices)
-            return stress(key, sim, more, top=top, progress=progress, callback=callback, **places)
+    again = by_default and test.cheap
+    while again and "interrupted" not in report.settings:
+        if (budget := budgets.next_budget(report.probability, budget)) is None:
+            break
+        places = dict(executor=executor, devices=devices)
+        report = stress(key, sim, budget, top=top, progress=progress, callback=callback, **places)
     return report
 
 
