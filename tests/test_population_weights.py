@@ -170,10 +170,11 @@ def test_where_no_way_leads_to_failures_the_rest_is_plain_draws(key, monkeypatch
 
 
 @pytest.mark.slow
-def test_sensitivities_are_told_by_the_gaussians_that_drew(key):
-    """d log P / d mean of 20 numbers N(m, 1), P = Phi(sqrt(20) m - 4), m = 0."""
+@pytest.mark.parametrize("beta, drawn", [(4.0, "then importance sampling"), (1.5, "plain draws")])
+def test_sensitivities_are_told_by_what_drew(beta, drawn, key):
+    """d log P / d mean of 20 numbers N(m, 1), P = Phi(sqrt(20) m - beta), m = 0."""
     noise = jax.tree_util.Partial(lambda m, s: D.Normal(m, 1.0), jnp.zeros(()))
-    gap = lambda s: 4.0 - s / 20**0.5
+    gap = lambda s: beta - s / 20**0.5
     sim = jast.Simulator(
         init=lambda x0: jnp.zeros(()),
         step=lambda s, w: s + w,
@@ -183,8 +184,8 @@ def test_sensitivities_are_told_by_the_gaussians_that_drew(key):
         episodic=True,
     )
     found = population(key, sim, 300_000)
-    assert found.method.endswith("then importance sampling")
+    assert found.method.endswith(drawn)
     told = jast.explain.sensitivity(sim, found)
-    truth = 20**0.5 * stats.norm.pdf(4) / stats.norm.sf(4)
+    truth = 20**0.5 * stats.norm.pdf(beta) / stats.norm.sf(beta)
     row = next(r for r in told.rows if r[1] == 0)
     assert told.reliable and abs(row[2] - truth) < 4 * row[3] < 0.1 * truth

@@ -30,7 +30,7 @@ from jast._src.runtime.checkpoints import open_checkpoint
 from jast._src.runtime.host_errors import incidents, merge_incidents, new_incidents
 from jast._src.runtime.progress_bar import Watch
 from jast._src.util import display
-from jast._src.util.checks import check_random_key
+from jast._src.util.checks import check_random_key, whole_number
 from jast._src.util.intervals import clopper_pearson
 from jast._src.util.pytrees import zero_where
 
@@ -151,13 +151,10 @@ def nominal(
         (1000, True)
     """
     check_random_key("nominal", key)
-    if isinstance(episodes, bool) or int(episodes) != episodes or not 1 <= episodes < 2**31:
-        raise ValueError(
-            f"nominal: episodes must be a whole number from 1 to 2^31 - 1, received {episodes!r}"
-        )
+    asked = whole_number("nominal", "episodes", episodes, 1, 2**31 - 1)
     contract("nominal", sim)
     placement = work.placement("nominal", executor, devices)
-    asked, before = int(episodes), incidents(sim)
+    before = incidents(sim)
     signature = signature_of(sim)
     calm = signature.start.mode and signature.disturbance.mode
     quiet = rollout(key, sim, undisturbed(sim)) if calm else None  # draws nothing

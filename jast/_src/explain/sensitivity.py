@@ -126,7 +126,8 @@ def sensitivity(
         )
     logs, scores = [], []
     if isinstance(q, Sample):  # as many of its failures as are worth independent ones, or Gaussians
-        q = estimate.draws.source
+        source = estimate.draws.source  # "model", whose failures are independent already
+        q = q if isinstance(source, str) else source
         samples = LANES if isinstance(q, Sample) else samples
     for i in range(-(-samples // LANES)):
         own = jax.random.fold_in(key, i)

@@ -201,13 +201,7 @@ def require_counts(function: str, **counts: Any) -> list[int]:
     """The counts as Python ints; ValueError naming the setting unless each is a whole number from 1
     to 2^31 - 1.
     """
-    for name, count in counts.items():
-        whole = isinstance(count, int | np.integer) and not isinstance(count, bool)
-        if not (whole and 1 <= count < 2**31):
-            raise ValueError(
-                f"{function}: {name} must be a whole number from 1 to 2^31 - 1, received {count!r}"
-            )
-    return [int(count) for count in counts.values()]
+    return [checks.whole_number(function, *c, 1, 2**31 - 1) for c in counts.items()]
 
 
 def require_host(function: str, key: jax.Array, sim: Simulator) -> None:

@@ -37,16 +37,15 @@ def check_random_key(function: str, key: Any) -> None:
         )
 
 
-def whole_number(function, name, value, least=1):
-    """``value`` as an int of at least ``least``."""
+def whole_number(function, name, value, least=1, most=None):
+    """``value`` as an int from ``least`` to ``most``, without a limit where that is None."""
     try:
         number = least - 1 if isinstance(value, bool) else operator.index(value)
     except (TypeError, jax.errors.JAXTypeError):
         number = least - 1
-    if number < least:
-        raise ValueError(
-            f"{function}: {name} must be a whole number of at least {least}, received {value!r}"
-        )
+    if number < least or (most is not None and number > most):
+        allowed = f"of at least {least}" if most is None else f"from {least} to {most}"
+        raise ValueError(f"{function}: {name} must be a whole number {allowed}, received {value!r}")
     return number
 
 
