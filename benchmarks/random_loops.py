@@ -273,7 +273,7 @@ def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
         calls=len(rows),
         loops=len({r["loop"] for r in rows}),
         reliable=len(good),
-        beyond_two=sum(z > 2 for z in apart),
+        beyond_two=len([z for z in apart if z > 2]),
         farthest=max(apart, default=None),
         median_seconds=float(np.median([r["seconds"] for r in rows])) if rows else None,
         most_seconds=max((r["seconds"] for r in rows), default=None),
