@@ -36,7 +36,7 @@ MAX_POPULATION_SECONDS = 24.0
 """CPU seconds of simulation up to which a call by default has `MIN_POPULATION_BUDGET` of them.
 Loops 6, 21 and 28 of `benchmarks.random_loops` take 27 microseconds an episode: with 100,000, by
 tilts, calls took 77 to 139 CPU seconds and were flagged; with these, and again with what they
-need, 24 to 45, and 5 of 6 answered."""
+need, 22 to 68, and all were answered."""
 MAX_DEFAULT_BUDGET = 2**25
 """Evaluations by default at most: static problems of few numbers are then answered within 3 % down
 to 1e-9, in seconds."""

@@ -179,7 +179,8 @@ class PopulationSearch:
         """Whether plain draws answer, and more exactly than the populations so far promise to."""
         if self.interrupted or not self.reached():
             return False
-        promised = self.expected_error(self.reached()[0]) * math.sqrt(WITNESS_SHARE)  # with all
+        whole = math.sqrt(WITNESS_SHARE)  # from the witness's part to the whole budget
+        promised = whole * self.expected_error(self.reached()[0])
         return self.plain_error() <= min(promised, MAX_RELATIVE_ERROR)
 
     def choose_kinds(self):
