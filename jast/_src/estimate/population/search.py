@@ -175,13 +175,19 @@ class PopulationSearch:
         expected = math.exp(self.answer(self.reached()[0]).log_mean) * (self.budget - self.spent)
         return expected**-0.5 if expected > 0 else math.inf
 
+    def promised_error(self):
+        """The relative standard error that populations promise: of two kinds that reached failures
+        the better one has what the witness leaves.
+        """
+        shares = (1 - WITNESS_SHARE) / WITNESS_SHARE, 1.0
+        each = zip(shares, self.reached())
+        return sum(share * self.expected_error(kind) ** -2 for share, kind in each) ** -0.5
+
     def plain_answers(self):
-        """Whether plain draws answer, and more exactly than the populations so far promise to."""
+        """Whether plain draws answer, and more exactly than populations promise to."""
         if self.interrupted or not self.reached():
             return False
-        whole = math.sqrt(WITNESS_SHARE)  # from the witness's part to the whole budget
-        promised = whole * self.expected_error(self.reached()[0])
-        return self.plain_error() <= min(promised, MAX_RELATIVE_ERROR)
+        return self.plain_error() <= min(self.promised_error(), MAX_RELATIVE_ERROR)
 
     def choose_kinds(self):
         """The two kinds that are to agree, the more exact for its cost first; one where there is
