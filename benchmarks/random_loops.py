@@ -240,7 +240,7 @@ def threshold_of(loop: RandomLoop, draws: int) -> float:
     return float(np.quantile(np.ravel(most), 1 - max(loop.target, LEAST_TARGET)))
 
 
-def row_of(number: int, keys: int, threshold_draws: int, draws: int) -> list[dict[str, Any]]:
+def rows_of(number: int, keys: int, threshold_draws: int, draws: int) -> list[dict[str, Any]]:
     """The answers of ``keys`` calls, and what plain draws of as many CPU seconds would tell."""
     loop = draw_loop(number)
     threshold = threshold_of(loop, threshold_draws)
@@ -248,7 +248,7 @@ def row_of(number: int, keys: int, threshold_draws: int, draws: int) -> list[dic
         return []
     sim = simulator_of(loop, jnp.float32(threshold))
     truth = jast.estimate.monte_carlo(jax.random.key(1000), sim, draws)
-    rows = []
+    in_a_second, rows = plain_draws(System(sim, truth.mean), 1.0), []
     for seed in range(keys):
         found, seconds, _ = timed(
             lambda seed=seed: jast.estimate.failure_probability(jax.random.key(seed), sim)
@@ -260,7 +260,7 @@ def row_of(number: int, keys: int, threshold_draws: int, draws: int) -> list[dic
         about |= dict(key=seed, ratio=found.mean / truth.mean, relative=found.relative_error, z=z)
         about |= dict(reliable=found.reliable, evaluations=int(found.evaluations), seconds=seconds)
         about |= dict(method=found.method, why="" if found.reliable else found.warnings[0])
-        about |= dict(plain=plain_draws(System(sim, truth.mean), seconds))
+        about |= dict(plain=in_a_second / math.sqrt(seconds) if in_a_second else None)
         rows.append({k: None if v != v else v for k, v in about.items()})
     return rows
 
@@ -293,7 +293,7 @@ def main(argv: list[str] | None = None) -> None:
     draws = args.draws or size(args, 3_000_000, 300_000, 2**15)
     say, rows = printer(args), []
     for number in range(first, end):
-        found = row_of(number, keys, size(args, THRESHOLD_DRAWS, THRESHOLD_DRAWS, 2**14), draws)
+        found = rows_of(number, keys, size(args, THRESHOLD_DRAWS, THRESHOLD_DRAWS, 2**14), draws)
         for r in found:
             say(_line(r))
         rows += found

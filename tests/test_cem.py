@@ -212,7 +212,7 @@ def test_interruption(key, equal):
     "settings, message",
     [
         (dict(samples=10, elites=11), "elites must be at most samples, 10, received 11"),
-        (dict(iterations=0), "iterations must be a whole number from 1 to 2147483647, received 0"),
+        (dict(iterations=0), "iterations must be a whole number from 1 to 2\\^31 - 1, received 0"),
         (dict(trees=True), "trees must be .* received True"),
         (dict(samples=2**20, trees=2**10), "below 2\\^31"),
         (dict(smoothing=1.5), "smoothing must be a number from 0 to 1, received 1.5"),

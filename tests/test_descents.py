@@ -526,12 +526,12 @@ def small(monkeypatch):
 @pytest.mark.slow
 def test_stress_where_failures_are_frequent(key, small):
     """P = .16: plain draws, and the likeliest failure at e^-.5."""
-    report = jast.stress(key, limit_state(lambda u: 1.0 - u[0], 2), 60_000)
+    report = jast.stress(key, limit_state(lambda u: 1.0 - u[0], 2), 120_000)
     p = report.probability
     assert "plain draws" in p.method and p.reliable
     assert abs(p.mean - norm.sf(1)) < 4 * p.standard_error
     assert float(report.failures.best.reward) == pytest.approx(-0.5, abs=0.05)
-    assert [m.share for m in report.modes] == [1.0] and report.episodes <= 1.02 * 60_000
+    assert [m.share for m in report.modes] == [1.0] and report.episodes <= 120_000
 
 
 @pytest.mark.slow

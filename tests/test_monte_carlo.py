@@ -252,7 +252,7 @@ def test_plain_functions_and_old_keys(key):
 @pytest.mark.parametrize(
     "settings, message",
     [
-        (dict(episodes=0), "episodes must be a whole number from 1 to 2147483647, received 0"),
+        (dict(episodes=0), "episodes must be a whole number from 1 to 2\\^31 - 1, received 0"),
         (dict(episodes=2.5), "episodes must be .* received 2.5"),
         (dict(top=0), "top must be .* received 0"),
         (dict(actions=actions.uniform(0.0, jnp.zeros(3))), "uniform"),

@@ -151,7 +151,7 @@ def nominal(
         (1000, True)
     """
     check_random_key("nominal", key)
-    asked = whole_number("nominal", "episodes", episodes, 1, 2**31 - 1)
+    asked = whole_number("nominal", "episodes", episodes, bits=31)
     contract("nominal", sim)
     placement = work.placement("nominal", executor, devices)
     before = incidents(sim)

@@ -24,7 +24,14 @@ from jast._src.normal_space import transform
 from jast._src.normal_space.transform import Outcomes
 from jast._src.runtime._jax import jit
 
-__all__ = ["dimension_of", "is_proposal_of", "redraw", "redraw_chunk", "redraw_failures"]
+__all__ = [
+    "dimension_of",
+    "is_proposal_of",
+    "redraw",
+    "redraw_chunk",
+    "redraw_failures",
+    "sample_of_draws",
+]
 
 
 def redraw(key: Any, sim: Any, q: Any, n: int) -> tuple[np.ndarray, Outcomes, np.ndarray]:
@@ -95,6 +102,18 @@ def redraw_failures(
     spent = len(chunks) * draws.lanes * isinstance(draws.source, tilts.Tilts)
     log_w = draws.log_weight[kept].astype(np.float64)
     return np.concatenate(points), log_w, draws.length[kept], spent
+
+
+def sample_of_draws(sim: Any, draws: Draws, most: int) -> Sample:
+    """The `Sample` of the failing draws that `redraw_failures` makes again, each by itself."""
+    points, log_w, length, _ = redraw_failures(sim, draws, most)
+    return Sample(
+        points=points,
+        used=transform.used_numbers(sim, length).astype(np.int32),
+        distance=np.zeros(len(points), points.dtype),
+        log_weight=log_w,
+        group=np.arange(len(points), dtype=np.int32),
+    )
 
 
 def _redraw_gaussians(key, sim, q, n):

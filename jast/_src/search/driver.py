@@ -201,7 +201,7 @@ def require_counts(function: str, **counts: Any) -> list[int]:
     """The counts as Python ints; ValueError naming the setting unless each is a whole number from 1
     to 2^31 - 1.
     """
-    return [checks.whole_number(function, *c, 1, 2**31 - 1) for c in counts.items()]
+    return [checks.whole_number(function, *c, bits=31) for c in counts.items()]
 
 
 def require_host(function: str, key: jax.Array, sim: Simulator) -> None:

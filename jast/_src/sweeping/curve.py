@@ -23,9 +23,9 @@ from jast._src.estimate.budgets import uses_populations
 from jast._src.estimate.population.descents import SETTINGS
 from jast._src.estimate.population.failure_sample import Sample
 from jast._src.estimate.population.search import MAX_DISAGREEMENT, MAX_WITNESS_ERROR
-from jast._src.estimate.redraw import redraw_failures
+from jast._src.estimate.redraw import sample_of_draws
 from jast._src.normal_space.evaluate_points import evaluate_points
-from jast._src.normal_space.transform import Latent, dimension, used_numbers
+from jast._src.normal_space.transform import Latent, dimension
 from jast._src.util.intervals import log_normal
 from jast.estimate import Estimate
 
@@ -147,12 +147,9 @@ def _row_of(key, sim, r):
     """The `Row` of a result that takes part."""
     if isinstance(r.proposal, Sample) and isinstance(r.draws.source, Sample):
         sample = r.proposal
-        points, used, log_w, family = sample.points, sample.used, sample.log_weight, sample.group
     else:  # draws of Gaussians, or of the model, which are independent
-        most = SETTINGS.max_numbers // dimension(sim)
-        points, log_w, length, _ = redraw_failures(sim, r.draws, most)
-        family = np.arange(len(points))
-        used = used_numbers(sim, length)
+        sample = sample_of_draws(sim, r.draws, SETTINGS.max_numbers // dimension(sim))
+    points, used, _, log_w, family = sample
     # what its own episode did not use may decide a neighbour's, so it is drawn from the model
     new = numpy_generator(key, 8).standard_normal(points.shape).astype(points.dtype)
     points = np.where(np.arange(points.shape[1]) < used[:, None], points, new)

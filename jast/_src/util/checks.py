@@ -37,14 +37,14 @@ def check_random_key(function: str, key: Any) -> None:
         )
 
 
-def whole_number(function, name, value, least=1, most=None):
-    """``value`` as an int from ``least`` to ``most``, without a limit where that is None."""
+def whole_number(function, name, value, least=1, bits=None):
+    """``value`` as an int of at least ``least``, and below 2^bits where ``bits`` are given."""
     try:
         number = least - 1 if isinstance(value, bool) else operator.index(value)
     except (TypeError, jax.errors.JAXTypeError):
         number = least - 1
-    if number < least or (most is not None and number > most):
-        allowed = f"of at least {least}" if most is None else f"from {least} to {most}"
+    if number < least or (bits is not None and number >= 2**bits):
+        allowed = f"of at least {least}" if bits is None else f"from {least} to 2^{bits} - 1"
         raise ValueError(f"{function}: {name} must be a whole number {allowed}, received {value!r}")
     return number
 

@@ -5,8 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-import numpy as np
-
 from jast._src.estimate.estimate import (
     Estimate,
     estimate_from_counts,
@@ -17,7 +15,6 @@ from jast._src.estimate.importance_sampling import chunks
 from jast._src.estimate.monte_carlo import lanes_of_points, simulate_points
 from jast._src.estimate.population.failure_sample import (
     MAX_FAILURES,
-    Sample,
     independent_draws,
     sample_from,
 )
@@ -29,10 +26,9 @@ from jast._src.estimate.population.search import (
     contradictions,
     pool_answers,
 )
-from jast._src.estimate.redraw import redraw_failures
+from jast._src.estimate.redraw import sample_of_draws
 from jast._src.estimate.weight_sums import empty_sums
 from jast._src.estimate.weighted_draws import with_source
-from jast._src.normal_space.transform import used_numbers
 from jast._src.runtime.progress_bar import Watch
 from jast._src.util.intervals import log_normal
 
@@ -111,21 +107,8 @@ def estimate_from_plain_draws(search: PopulationSearch, name: str, level: float)
         history=tuple(search.history),
     )
     draws = with_source(found.draws, search.key, lanes, "model")
-    return found._replace(draws=draws, proposal=_failures_among(search.sim, draws))
-
-
-def _failures_among(sim, draws):
-    """The `Sample` of the failures among plain draws, each by itself; None where there is none."""
-    if not draws.failure.any():
-        return None
-    points, _, length, _ = redraw_failures(sim, draws, MAX_FAILURES)
-    return Sample(
-        points=points,
-        used=used_numbers(sim, length).astype(np.int32),
-        distance=np.zeros(len(points), points.dtype),
-        log_weight=np.zeros(len(points)),
-        group=np.arange(len(points), dtype=np.int32),
-    )
+    failing = sample_of_draws(search.sim, draws, MAX_FAILURES) if draws.failure.any() else None
+    return found._replace(draws=draws, proposal=failing)
 
 
 def _agreed_answer(search, kinds):

@@ -193,10 +193,9 @@ class PopulationSearch:
         """The two kinds that are to agree, the more exact for its cost first; one where there is
         no second, and () where no failure was reached.
         """
-        seen = [k for k in map(self.first_kind, DESCENTS) if self.answer(k) is not None]
+        seen = self.reached()
         if not seen:
             return ()
-        seen = self.sorted_by_cost(seen)
         if len(seen) == 2 and self.expected_error(seen[1]) <= MAX_WITNESS_ERROR:
             return seen
         # one way alone: its moves are doubled until its answer stays

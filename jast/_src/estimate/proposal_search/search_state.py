@@ -192,8 +192,8 @@ def add_batch(family: Family, state: SearchState, batch: Batch) -> SearchState:
     batches = (*state.batches, batch)
     scored = []
     for q in _distinct(batches):
-        new = -batch.log_weight if q is batch.q else family.log_ratio(q, batch.points)
-        scored.append(Scored(q, np.concatenate([failure_log_ratios(family, state, q), new])))
+        here = -batch.log_weight if q is batch.q else family.log_ratio(q, batch.points)
+        scored.append(Scored(q, np.concatenate([failure_log_ratios(family, state, q), here])))
     new = state._replace(batches=batches, scored=tuple(scored))
     over = np.stack([s.log_ratio for s in scored]) + _log_shares(new)[:, None]
     log_w = -np.logaddexp.reduce(over, axis=0)
