@@ -212,11 +212,12 @@ def is_doubtful(p: Estimate) -> bool:
 
 
 def times_too_few(found: Estimate) -> float:
-    """How many times as many evaluations make an `Estimate` reliable that is UNRELIABLE by its
-    standard error alone; 1 for every other one.
+    """How many times as many evaluations bring an `Estimate` of which nothing is wrong but its
+    standard error to `MAX_RELATIVE_ERROR`; 1 at least, and for every other one.
     """
-    imprecise = not found.reliable and "".join(found.warnings[:1]).startswith(IMPRECISE)
-    return (found.relative_error / MAX_RELATIVE_ERROR) ** 2 if imprecise else 1.0
+    # an interrupted one of plain draws is reliable, with a warning
+    imprecise = found.warnings[0].startswith(IMPRECISE) if found.warnings else found.reliable
+    return max((found.relative_error / MAX_RELATIVE_ERROR) ** 2, 1.0) if imprecise else 1.0
 
 
 def flag_imprecise(found: Estimate) -> Estimate:

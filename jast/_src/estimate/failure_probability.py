@@ -225,15 +225,18 @@ def failure_probability(
             found = flag_imprecise(found) if budget >= MIN_BUDGET else found
     found = found._replace(settings=settings)
     while by_default and not few and (budget := budgets.next_budget(found, budget)) is not None:
-        again = failure_probability(
-            *(key, sim, budget),
-            gradients=gradients,
-            level=level,
-            progress=progress,
-            callback=callback,
-            executor=executor,
-            devices=devices,
-        )
+        try:
+            again = failure_probability(
+                *(key, sim, budget),
+                gradients=gradients,
+                level=level,
+                progress=progress,
+                callback=callback,
+                executor=executor,
+                devices=devices,
+            )
+        except KeyboardInterrupt:
+            break
         said = f"{found.evaluations} evaluations were too few: {found.relative_error:.1%}"
         found = again._replace(history=(said, *again.history))
     return found

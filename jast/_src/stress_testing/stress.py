@@ -247,7 +247,12 @@ def stress(
         if (budget := budgets.next_budget(report.probability, budget)) is None:
             break
         places = dict(executor=executor, devices=devices)
-        report = stress(key, sim, budget, top=top, progress=progress, callback=callback, **places)
+        try:
+            report = stress(
+                key, sim, budget, top=top, progress=progress, callback=callback, **places
+            )
+        except KeyboardInterrupt:
+            break
     return report
 
 

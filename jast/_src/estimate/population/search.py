@@ -12,7 +12,7 @@ import jax
 import numpy as np
 
 from jast._src.core.float_resolution import rounding_problem
-from jast._src.estimate.estimate import MAX_INVALID_SHARE, MAX_RELATIVE_ERROR
+from jast._src.estimate.estimate import MAX_INVALID_SHARE
 from jast._src.estimate.population.descents import DESCENTS, SETTINGS, Descent
 from jast._src.runtime import work as units
 from jast._src.runtime.backends import Task
@@ -44,6 +44,9 @@ ENOUGH_PLAIN_FAILURES = 1000
 """Failures among plain draws that tell a probability to 3 %: then they are all that is drawn."""
 MIN_PLAIN_FAILURES = 10
 """Failures among the first plain draws from which the probability is roughly known."""
+MAX_PLAIN_ERROR = 0.2
+"""Relative standard error that plain draws promise at most: 25 failures expected, of which chance
+leaves fewer than the ten of a plain answer (`estimate.MIN_COUNTED_FAILURES`) once in 4500."""
 MIN_POINTS = 512
 """Points that a population at least has where it is one of several: its own error is then told."""
 
@@ -187,7 +190,7 @@ class PopulationSearch:
         """Whether plain draws answer, and more exactly than populations promise to."""
         if self.interrupted or not self.reached():
             return False
-        return self.plain_error() <= min(self.promised_error(), MAX_RELATIVE_ERROR)
+        return self.plain_error() <= min(self.promised_error(), MAX_PLAIN_ERROR)
 
     def choose_kinds(self):
         """The two kinds that are to agree, the more exact for its cost first; one where there is
