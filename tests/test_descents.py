@@ -561,7 +561,28 @@ def test_a_default_stress_is_made_again_where_a_known_budget_would_do(key, small
     sim = limit_state(lambda u: 1.0 - u[0], 2)
     report, again = jast.stress(key, sim), jast.stress(key, sim, 60_000)
     assert report.settings["budget"] == 60_000
-    assert report.probability.interval == again.probability.interval
+    assert str(report) == str(again) and report.tried == again.tried
+
+
+@pytest.mark.slow
+def test_an_interrupted_second_stress_keeps_the_first_answer(key, small, monkeypatch):
+    """The first has only the probability by which it is made again: it cools nothing."""
+    called = []
+
+    def once(name, key, sim, budget, **how):
+        called.append(budget)
+        if len(called) == 2:
+            raise KeyboardInterrupt
+        return by_populations(name, key, sim, budget, **how)
+
+    by_populations = stress.by_populations
+    monkeypatch.setattr(budgets, "measure_budget", lambda *args: 50_000)
+    monkeypatch.setattr(budgets, "next_budget", lambda found, budget: 2 * budget)
+    monkeypatch.setattr(stress, "by_populations", once)
+    report = jast.stress(key, limit_state(lambda u: 1.0 - u[0], 2))
+    assert len(called) == 2 and report.probability.mean > 0
+    assert [t.name for t in report.tried] == ["nominal", "populations"]
+    assert "100000" in report.settings["interrupted"] and "interrupted" in str(report)
 
 
 @pytest.mark.long

@@ -213,8 +213,27 @@ def stress(
         budget = DEFAULT_BUDGET
     if budget is None:
         budget = budgets.measure_budget(name, key, sim, seconds, MIN_BUDGET, DEFAULT_BUDGET)
+    about = dict(top=top, progress=progress, callback=callback, checkpoint=checkpoint)
+    about |= dict(placement=work.placement(name, executor, devices), by_default=by_default)
+    report, more = _stress_once(key, sim, budget, **about)
+    while more is not None:
+        interrupted = f"while it was made again with {more} evaluations"
+        try:
+            again, more = _stress_once(key, sim, more, **about)
+        except KeyboardInterrupt:
+            again = None
+        if again is None or again.probability is None:  # the first answer is not lost
+            return report._replace(settings=report.settings | dict(interrupted=interrupted))
+        report = again
+    return report
+
+
+def _stress_once(key, sim, budget, *, top, progress, callback, checkpoint, placement, by_default):
+    """The `Report` of so many evaluations, and with how many it is to be made again: then it has
+    only the probability by which that was decided. None: it is not.
+    """
+    name, more = "stress", None
     settings = call_settings(name, key, budget=budget, top=top)
-    placement = work.placement(name, executor, devices)
     with (
         runs_apart(sim),  # so that the same call is the same, whatever ran before
         open_checkpoint(name, checkpoint, key, sim=sim, budget=budget, top=top) as store,
@@ -233,6 +252,9 @@ def stress(
                 test.run_nominal()
                 if test.cheap:
                     test.run_populations()
+                    more = budgets.next_budget(test.probability, budget) if by_default else None
+                    if more is None:
+                        test.find_likeliest()
                 else:
                     test.search()
                     test.refine()
@@ -241,19 +263,7 @@ def stress(
             if test.nominal is None:
                 raise
             settings["interrupted"] = f"after {test.spent} of {budget} evaluations"
-        report = test.report(settings)
-    again = by_default and test.cheap
-    while again and "interrupted" not in report.settings:
-        if (budget := budgets.next_budget(report.probability, budget)) is None:
-            break
-        places = dict(executor=executor, devices=devices)
-        try:
-            report = stress(
-                key, sim, budget, top=top, progress=progress, callback=callback, **places
-            )
-        except KeyboardInterrupt:
-            break
-    return report
+        return test.report(settings), more
 
 
 class _StressTest:
@@ -336,17 +346,25 @@ class _StressTest:
         return collect(self.sim, self.reward, stacked)
 
     def run_populations(self):
-        """The probability by populations, and the likeliest failures from theirs."""
-        cooling = int(COOLING_SHARE * self.budget)
-        if not on_cpu():
-            cooling = min(cooling, COOLING_BESIDE_ACCELERATOR)
-        refining = min(REFINE_EVALUATIONS, self.budget // 8)
+        """The probability by populations."""
+        cooling, refining = self.cooling_and_refining()
         rest = self.budget - self.spent - cooling - 2 * refining
         rest = max(rest, MIN_POPULATION_BUDGET // 2)
         self.watch.doing("estimating")
         p = by_populations("stress", self.next_key(), self.sim, rest, placement=self.placement)
         self.keep_probability(p, "populations")
-        sample = p.proposal
+
+    def cooling_and_refining(self):
+        """Evaluations to cool failures of populations, and to refine what was cooled."""
+        cooling = int(COOLING_SHARE * self.budget)
+        if not on_cpu():
+            cooling = min(cooling, COOLING_BESIDE_ACCELERATOR)
+        return cooling, min(REFINE_EVALUATIONS, self.budget // 8)
+
+    def find_likeliest(self):
+        """The likeliest failures, from those of the populations, and their modes."""
+        cooling, refining = self.cooling_and_refining()
+        sample = self.probability.proposal
         if not isinstance(sample, Sample):
             # nothing leads to failures
             self.parts = BudgetShares(nominal=0, search=refining, slow_search=0, refine=refining)
