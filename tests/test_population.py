@@ -17,7 +17,7 @@ from jast import distributions as D
 from jast._src.core.counter_prng import counter_key
 from jast._src.estimate import budgets
 from jast._src.estimate import failure_probability as module
-from jast._src.estimate.estimate import flag_imprecise
+from jast._src.estimate.estimate import UNCONFIRMED, flag_imprecise
 from jast._src.estimate.population import answer
 from jast._src.estimate.population import descents as ways
 from jast._src.estimate.population import search as populations
@@ -514,6 +514,9 @@ def test_a_default_call_by_plain_draws_is_made_again_too(two, key, monkeypatch):
     monkeypatch.setattr(module, "by_populations", answer_with)
     found = failure_probability(key, SIDES)
     assert called == [3 * 2**17, 2**20] and found.settings["budget"] == called[0]
+    unconfirmed = wide._replace(mean=1e-3, reliable=False, warnings=(UNCONFIRMED,))
+    assert budgets.next_budget(unconfirmed, 400_000) == 2**20  # plain draws: 600,000
+    assert budgets.next_budget(unconfirmed._replace(mean=1e-4), 400_000) is None  # 6 million
     interrupted = wide._replace(warnings=("interrupted after 10 of 400000 evaluations",))
     assert budgets.next_budget(interrupted, called[0]) is None
 
@@ -586,6 +589,16 @@ def test_plain_draws_answer_within_more_than_five_per_cent(seed):
     assert "plain draws" in found.method and found.reliable and not found.warnings
     assert 0.07 < found.relative_error < 0.1
     assert abs(found.mean - truth) < 4 * found.standard_error
+
+
+@pytest.mark.slow
+def test_plain_draws_answer_where_ways_do_not_agree(key, monkeypatch):
+    """Two ways that begin anew with twice the moves would tell less than plain draws of .0027."""
+    monkeypatch.setattr(populations, "MAX_DISAGREEMENT", -1.0)
+    found = population(key, SIDES, 200_000)
+    assert "plain draws" in found.method and found.reliable
+    assert abs(found.mean - 2 * stats.norm.sf(3)) < 4 * found.standard_error
+    assert not any("20 moves" in said for said in found.history)
 
 
 @pytest.mark.slow

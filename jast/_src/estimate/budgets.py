@@ -45,9 +45,9 @@ DEFAULT_BUDGET = 100_000
 `MAX_POPULATION_SECONDS`."""
 STEADY_BUDGET = 2**22
 """Evaluations at most with which a call by default is made again where its first answer is
-UNRELIABLE by its standard error alone and these would do: so the verdict follows from the system,
-not from how busy the machine was. The landing of `benchmarks.closed_loops` needs 2.3 million, and
-was given 1."""
+too imprecise, or not confirmed, and these would do: so the verdict follows from the system, not
+from how busy the machine was. What is not confirmed has what plain draws need. The landing of
+`benchmarks.closed_loops` needs 2.3 million, and was given 1."""
 PLAIN_SHARE = 2 / 3
 """Share of a budget that plain draws have where they are best: two populations were first."""
 TIMED_SECONDS = 0.2

@@ -17,6 +17,7 @@ from jast._src.util.intervals import checked_level, chernoff, clopper_pearson, j
 __all__ = [
     "MAX_INVALID_SHARE",
     "MAX_RELATIVE_ERROR",
+    "UNCONFIRMED",
     "Estimate",
     "estimate_from_counts",
     "estimate_from_mean",
@@ -34,7 +35,9 @@ MIN_COUNTED_FAILURES = 10
 MAX_RELATIVE_ERROR = 0.05
 """Relative standard error above which 10 % more or less lies within a 95 % interval."""
 IMPRECISE = "relative standard error"
-"""What the warning of one above that begins with."""
+"""How the warning begins of an `Estimate` that nothing is wrong with but that."""
+UNCONFIRMED = "not confirmed:"
+"""How the warning begins of an `Estimate` that no second way agrees with."""
 MAX_LISTED_MODES = 12
 """Modes that are printed: a line of the screen."""
 
@@ -213,10 +216,14 @@ def is_doubtful(p: Estimate) -> bool:
 
 def times_too_few(found: Estimate) -> float:
     """How many times as many evaluations bring an `Estimate` of which nothing is wrong but its
-    standard error to `MAX_RELATIVE_ERROR`; 1 at least, and for every other one.
+    standard error to `MAX_RELATIVE_ERROR`: 1 at least; inf where nothing confirms it, so that this
+    is not known, and 1 for every other one.
     """
+    first = "".join(found.warnings[:1])
+    if not found.reliable and first.startswith(UNCONFIRMED):
+        return math.inf
     # an interrupted one of plain draws is reliable, with a warning
-    imprecise = found.warnings[0].startswith(IMPRECISE) if found.warnings else found.reliable
+    imprecise = first.startswith(IMPRECISE) or found.reliable and not first
     return max((found.relative_error / MAX_RELATIVE_ERROR) ** 2, 1.0) if imprecise else 1.0
 
 

@@ -127,8 +127,9 @@ def failure_probability(
         sim: the simulator; its disturbances have quantile functions.
         budget: episodes to simulate, at least 50. Default: what the system simulates in some eight
             CPU seconds, from 300,000 to 33,554,432; 100,000 where 300,000 take more than 24. Where
-            only the standard error of an answer by populations makes it UNRELIABLE, and 4,194,304
-            would do, it is made again with as many as it needs (but not with a ``checkpoint``).
+            the standard error of an answer by populations or plain draws is above 5 %, or nothing
+            confirms it, and 4,194,304 would do, it is made again with as many as it needs (but not
+            with a ``checkpoint``).
         seconds: in place of ``budget``: as many episodes as the system simulates in so many CPU
             seconds (a black box: seconds), rounded down to 2^k or 3 2^k. Compilation and the
             method's own work come on top.

@@ -168,11 +168,11 @@ def stress(
         budget: evaluations (episodes; one with its gradient counts as 3 or 4) in all, nearly; of
             a black box its runs, never more, with all that the call runs; at least 300. Default:
             what the system simulates in some eight CPU seconds, from 300,000 to 33,554,432; 200,000
-            where 300,000 take more than 24. Where only the standard error of a probability by
-            populations makes it UNRELIABLE, and 4,194,304 would do, everything is done again with
-            as many as it needs (but not with a ``checkpoint``). The report's ``settings`` name the
-            one that was used. Below 10,417 the probability is that of `failure_probability` with
-            few calls.
+            where 300,000 take more than 24. Where the standard error of a probability by
+            populations or plain draws is above 5 %, or nothing confirms it, and 4,194,304 would do,
+            it is asked again with as many as it needs (but not with a ``checkpoint``). The report's
+            ``settings`` name the one that was used. Below 10,417 the probability is that of
+            `failure_probability` with few calls.
         seconds: in place of ``budget``: as many evaluations as the system simulates in so many CPU
             seconds (a black box: seconds), rounded down to 2^k or 3 2^k.
         top: failures kept, at least one for each mode.

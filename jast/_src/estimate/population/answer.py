@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 
 from jast._src.estimate.estimate import (
+    UNCONFIRMED,
     Estimate,
     estimate_from_counts,
     estimate_from_mean,
@@ -118,13 +119,13 @@ def _agreed_answer(search, kinds):
     answers = [search.answer(k) for k in kinds]
     if len(answers) == 1:
         return answers[0], [
-            f"populations {kinds[0]}, are all that tells the probability, and none checks them"
+            f"{UNCONFIRMED} populations {kinds[0]}, are all that tells the probability"
         ]
     apart = answers[0].apart(answers[1])
     said = " and ".join(f"{a} {k}" for k, a in zip(kinds, answers, strict=True))
     search.history.append(f"{said}: {apart:.1f} standard errors apart")
     if apart > MAX_DISAGREEMENT:
-        return answers[0], [f"the ways do not agree: {said}"]
+        return answers[0], [f"{UNCONFIRMED} the ways do not agree, {said}"]
     return pool_answers(answers), []
 
 

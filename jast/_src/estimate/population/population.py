@@ -184,9 +184,10 @@ def by_populations(
         kinds, by_weights = () if plain else search.choose_kinds(), None
         if kinds:
             kinds = search.compare(kinds)
-            if len(kinds) == 2 and not search.interrupted:
+            plain = not search.agree(kinds) and search.plain_answers(kinds)
+            if len(kinds) == 2 and not (plain or search.interrupted):
                 by_weights = importance_estimate(search, name, kinds, level)
-            plain = by_weights is None and search.plain_answers()
+            plain = plain or by_weights is None and search.plain_answers()
         if plain or not kinds:
             return estimate_from_plain_draws(search, name, level)
         if by_weights is None:

@@ -47,6 +47,9 @@ MIN_PLAIN_FAILURES = 10
 MAX_PLAIN_ERROR = 0.2
 """Relative standard error that plain draws promise at most: 25 failures expected, of which chance
 leaves fewer than the ten of a plain answer (`estimate.MIN_COUNTED_FAILURES`) once in 4500."""
+ANEW = 2.0
+"""How many times as great a standard error two ways have that begin anew: the moves are twice as
+many, and half of the budget is spent."""
 MIN_POINTS = 512
 """Points that a population at least has where it is one of several: its own error is then told."""
 
@@ -158,8 +161,11 @@ class PopulationSearch:
 
     def expected_error(self, kind):
         """The relative standard error of this kind after the witness's part of the budget."""
-        cost = self.answer(kind).relative ** 2 * self.cost(kind) * self.n
-        return math.sqrt(cost / (WITNESS_SHARE * self.budget))
+        return math.sqrt(self.evaluations_for_one(kind) / (WITNESS_SHARE * self.budget))
+
+    def evaluations_for_one(self, kind):
+        """How many evaluations of this kind tell the probability with a relative variance of 1."""
+        return self.answer(kind).relative ** 2 * self.evaluations(kind)
 
     def failures_are_frequent(self):
         """Whether plain draws meet enough of them."""
@@ -186,11 +192,14 @@ class PopulationSearch:
         each = zip(shares, self.reached())
         return sum(share * self.expected_error(kind) ** -2 for share, kind in each) ** -0.5
 
-    def plain_answers(self):
-        """Whether plain draws answer, and more exactly than populations promise to."""
+    def plain_answers(self, compared=()):
+        """Whether plain draws answer, and more exactly than populations promise to: those that were
+        ``compared`` and do not agree would have to begin anew.
+        """
         if self.interrupted or not self.reached():
             return False
-        return self.plain_error() <= min(self.promised_error(), MAX_PLAIN_ERROR)
+        times = 1.0 if self.agree(compared) else ANEW
+        return self.plain_error() <= min(times * self.promised_error(), MAX_PLAIN_ERROR)
 
     def choose_kinds(self):
         """The two kinds that are to agree, the more exact for its cost first; one where there is
@@ -214,12 +223,12 @@ class PopulationSearch:
 
     def sorted_by_cost(self, kinds):
         """The ``kinds``, those first whose variance costs least."""
-        return tuple(sorted(kinds, key=lambda k: self.answer(k).relative ** 2 * self.cost(k)))
+        return tuple(sorted(kinds, key=self.evaluations_for_one))
 
     def compare(self, kinds):
         """Spend a third of all on the second of two ways. Where they do not agree, both begin anew
-        with twice the moves, as the more slowly mixing one may be wrong within its error. Returns
-        the kinds that were compared last.
+        with twice the moves, as the more slowly mixing one may be wrong within its error, unless
+        plain draws answer. Returns the kinds that were compared last.
         """
         if len(kinds) < 2 or kinds[0].way == kinds[1].way:
             return kinds
@@ -228,7 +237,9 @@ class PopulationSearch:
             self.fill(kinds[1], min(share, self.budget - self.spent))
             doubled = tuple(k.doubled for k in kinds)
             cost = self.n * sum(map(self.cost, doubled))
-            if self.agree(kinds) or self.spent + cost > self.budget:
+            if self.agree(kinds) or self.plain_answers(kinds):
+                return kinds
+            if self.spent + cost > self.budget:
                 return kinds
             for kind in doubled:
                 self.run(kind, 1)
@@ -237,7 +248,9 @@ class PopulationSearch:
             kinds = self.sorted_by_cost(doubled)
 
     def agree(self, kinds):
-        """Whether two kinds agree within their errors."""
+        """Whether two kinds agree within their errors; fewer do."""
+        if len(kinds) < 2:
+            return True
         return self.answer(kinds[0]).apart(self.answer(kinds[1])) <= MAX_DISAGREEMENT
 
     def fill(self, kind, evaluations):
