@@ -254,7 +254,8 @@ def _stress_once(key, sim, budget, *, top, progress, callback, checkpoint, place
                     test.run_populations()
                     more = budgets.next_budget(test.probability, budget) if by_default else None
                     if more is None:
-                        test.find_likeliest()
+                        with briefly(True):  # it plays some ten thousand
+                            test.find_likeliest()
                 else:
                     test.search()
                     test.refine()
