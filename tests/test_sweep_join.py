@@ -170,6 +170,21 @@ def test_a_sweep_is_joined_wherever_its_rows_run(key, tmp_path, equal):
     equal(again.ratios, table.ratios)
 
 
+@pytest.mark.slow
+def test_rows_by_plain_draws_take_part(key):
+    """.05 of the first row, which plain draws tell; the third one has .0024, and other ways."""
+    limits = (6.2, 7.8, 9.6)
+    table = jast.sweep(key, lambda limit: walk(limit, 10), {"limit": limits}, budget=300_000)
+    plain = ["plain draws" in r.method for r in table.results]
+    assert plain[0] and not plain[2]
+    truth = log_truth(limits, 10)
+    assert np.isfinite(table.curve).all() and np.isfinite(table.ratios).all()
+    half = np.diff(np.log(table.interval), axis=1)[:, 0] / 2
+    assert (np.abs(np.log(table.probability) - truth) < 4.5 / 1.96 * half).all()
+    half = np.diff(np.log(table.ratios[:, 1:]), axis=1)[:, 0] / 2
+    assert (np.abs(np.log(table.ratios[:, 0]) - np.diff(truth)) < 4.5 / 1.96 * half).all()
+
+
 @pytest.mark.long
 def test_ratios_of_whole_sweeps_are_sharper_and_held():
     """10 sweeps of 8 values at 2e-4 to 1e-5. 70 ratios: fewer than 60 in their intervals has a

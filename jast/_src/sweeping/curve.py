@@ -140,7 +140,9 @@ def _measure(chain):
 def _takes_part(sim, r):
     """Whether a result is reliable, and of a cheap system whose failures are points."""
     good = isinstance(r, Estimate) and r.reliable and uses_populations(sim, r.settings["budget"])
-    return good and r.draws is not None and isinstance(r.draws.source, Sample | Latent)
+    if not good or r.draws is None:
+        return False
+    return r.draws.source == "model" or isinstance(r.draws.source, Sample | Latent)
 
 
 def _row_of(key, sim, r):
