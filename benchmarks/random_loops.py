@@ -1,5 +1,5 @@
 """Closed loops that nobody chose: ``python -m benchmarks.random_loops [--json] [--quick | --smoke]
-[--loops FROM TO] [--keys N] [--draws N]``.
+[--loops FROM TO] [--keys N] [--draws N] [--stress]``.
 
 Each is drawn by its number: a linear plant of 2 to 4 states under linear feedback of 50 to 150
 steps, whose actuator clips, is limited in rate, has a dead zone or is a relay, whose controller may
@@ -8,8 +8,9 @@ jumps. It fails by leaving, by leaving to one side, by staying outside, by leavi
 by its energy. Its miss distance is the true one, a coarse one, a constant, or that of another
 quantity. The threshold is the quantile of plain draws at 3e-5 to 1e-3.
 
-The truth is that of further plain draws. `jast.estimate.failure_probability` is called as it comes.
-Where both have an error, ``z`` is how many standard errors they are apart.
+The truth is that of further plain draws. `jast.estimate.failure_probability` is called as it comes,
+or `jast.stress`, whose likeliest failure is told beside its probability. Where both have an error,
+``z`` is how many standard errors they are apart.
 """
 
 import math
@@ -240,7 +241,19 @@ def threshold_of(loop: RandomLoop, draws: int) -> float:
     return float(np.quantile(np.ravel(most), 1 - max(loop.target, LEAST_TARGET)))
 
 
-def rows_of(number: int, keys: int, threshold_draws: int, draws: int) -> list[dict[str, Any]]:
+def ask(key: jax.Array, sim: jast.Simulator, stress: bool) -> tuple[jast.estimate.Estimate, float]:
+    """The probability, and log p of the likeliest failure relative to the mode, NaN where none was
+    asked for.
+    """
+    if not stress:
+        return jast.estimate.failure_probability(key, sim), math.nan
+    report = jast.stress(key, sim)
+    return report.probability, float(report.failures.best.reward)
+
+
+def rows_of(
+    number: int, keys: int, threshold_draws: int, draws: int, stress: bool = False
+) -> list[dict[str, Any]]:
     """The answers of ``keys`` calls, and what plain draws of as many CPU seconds would tell."""
     loop = draw_loop(number)
     threshold = threshold_of(loop, threshold_draws)
@@ -250,9 +263,7 @@ def rows_of(number: int, keys: int, threshold_draws: int, draws: int) -> list[di
     truth = jast.estimate.monte_carlo(jax.random.key(1000), sim, draws)
     in_a_second, rows = plain_draws(System(sim, truth.mean), 1.0), []
     for seed in range(keys):
-        found, seconds, _ = timed(
-            lambda seed=seed: jast.estimate.failure_probability(jax.random.key(seed), sim)
-        )
+        (found, best), seconds, _ = timed(lambda seed=seed: ask(jax.random.key(seed), sim, stress))
         z = (found.log_mean - truth.log_mean) / math.hypot(
             found.relative_error, truth.relative_error
         )
@@ -260,7 +271,7 @@ def rows_of(number: int, keys: int, threshold_draws: int, draws: int) -> list[di
         about |= dict(key=seed, ratio=found.mean / truth.mean, relative=found.relative_error, z=z)
         about |= dict(reliable=found.reliable, evaluations=int(found.evaluations), seconds=seconds)
         about |= dict(method=found.method, why="" if found.reliable else found.warnings[0])
-        about |= dict(plain=in_a_second / math.sqrt(seconds) if in_a_second else None)
+        about |= dict(plain=in_a_second / math.sqrt(seconds) if in_a_second else None, best=best)
         rows.append({k: None if v != v else v for k, v in about.items()})
     return rows
 
@@ -287,13 +298,17 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--loops", nargs=2, type=int, metavar=("FROM", "TO"), help="default: 0 20")
     parser.add_argument("--keys", type=int, help="calls of a loop (default: 2)")
     parser.add_argument("--draws", type=int, help="plain draws of a truth (default: 3,000,000)")
+    parser.add_argument(
+        "--stress", action="store_true", help="jast.stress in place of the estimate"
+    )
     args = parser.parse_args(argv)
     first, end = args.loops or size(args, (0, 20), (14, 16), (0, 1))
     keys = args.keys or size(args, 2, 1, 1)
     draws = args.draws or size(args, 3_000_000, 300_000, 2**15)
     say, rows = printer(args), []
     for number in range(first, end):
-        found = rows_of(number, keys, size(args, THRESHOLD_DRAWS, THRESHOLD_DRAWS, 2**14), draws)
+        for_threshold = size(args, THRESHOLD_DRAWS, THRESHOLD_DRAWS, 2**14)
+        found = rows_of(number, keys, for_threshold, draws, args.stress)
         for r in found:
             say(_line(r))
         rows += found
@@ -304,11 +319,13 @@ def main(argv: list[str] | None = None) -> None:
 
 def _line(r):
     ratio, z = ("-" if r[k] is None else f"{r[k]:.3f}" for k in ("ratio", "z"))
+    best = "" if r["best"] is None else f" log p {r['best']:.3f} at most;"
     head = f"#{r['loop']} {r['about']}: {r['truth']:.3g} +- {percent(r['error'])}\n"
     return (
         f"{head if not r['key'] else ''}   {'ok  ' if r['reliable'] else 'FLAG'} {ratio} of it,"
         f" SE {percent(r['relative'])}, z {z}, {r['evaluations']} evaluations,"
-        f" {r['seconds']:.1f} CPU s (plain draws {percent(r['plain'])}); {r['method']}  {r['why']}"
+        f" {r['seconds']:.1f} CPU s (plain draws {percent(r['plain'])});{best} {r['method']} "
+        f" {r['why']}"
     )
 
 
