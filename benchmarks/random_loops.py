@@ -248,7 +248,8 @@ def ask(key: jax.Array, sim: jast.Simulator, stress: bool) -> tuple[jast.estimat
     if not stress:
         return jast.estimate.failure_probability(key, sim), math.nan
     report = jast.stress(key, sim)
-    return report.probability, float(report.failures.best.reward)
+    likeliest = float(report.failures.best.reward) if len(report.failures) else math.nan
+    return report.probability, likeliest
 
 
 def rows_of(
@@ -298,9 +299,7 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--loops", nargs=2, type=int, metavar=("FROM", "TO"), help="default: 0 20")
     parser.add_argument("--keys", type=int, help="calls of a loop (default: 2)")
     parser.add_argument("--draws", type=int, help="plain draws of a truth (default: 3,000,000)")
-    parser.add_argument(
-        "--stress", action="store_true", help="jast.stress in place of the estimate"
-    )
+    parser.add_argument("--stress", action="store_true", help="call jast.stress")
     args = parser.parse_args(argv)
     first, end = args.loops or size(args, (0, 20), (14, 16), (0, 1))
     keys = args.keys or size(args, 2, 1, 1)
