@@ -514,6 +514,7 @@ def test_a_default_call_by_plain_draws_is_made_again_too(two, key, monkeypatch):
     monkeypatch.setattr(module, "by_populations", answer_with)
     found = failure_probability(key, SIDES)
     assert called == [3 * 2**17, 2**20] and found.settings["budget"] == called[0]
+    assert "interrupted" in found.history[-1]
     unconfirmed = wide._replace(mean=1e-3, reliable=False, warnings=(UNCONFIRMED,))
     assert budgets.next_budget(unconfirmed, 400_000) == 2**20  # plain draws: 600,000
     assert budgets.next_budget(unconfirmed._replace(mean=1e-4), 400_000) is None  # 6 million

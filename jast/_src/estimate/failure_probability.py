@@ -237,7 +237,8 @@ def failure_probability(
                 devices=devices,
             )
         except KeyboardInterrupt:
-            break
+            said = f"interrupted while it was made again with {budget} evaluations"
+            return found._replace(history=(*found.history, said))
         said = f"{found.evaluations} evaluations were too few: {found.relative_error:.1%}"
         found = again._replace(history=(said, *again.history))
     return found

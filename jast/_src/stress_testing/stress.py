@@ -254,7 +254,7 @@ def _stress_once(key, sim, budget, *, top, progress, callback, checkpoint, place
                     test.run_populations()
                     more = budgets.next_budget(test.probability, budget) if by_default else None
                     if more is None:
-                        with briefly(True):  # it plays some ten thousand
+                        with briefly(True):  # what it compiles plays some ten thousand episodes
                             test.find_likeliest()
                 else:
                     test.search()

@@ -49,8 +49,8 @@ MAX_PLAIN_ERROR = 0.2
 leaves fewer than the ten of a plain answer (`estimate.MIN_COUNTED_FAILURES`) once in 4500."""
 DOUBT = 1.5
 """How many times as great as promised the standard error of populations may turn out, where it is
-to make them UNRELIABLE anyway. Of 75 calls of loops 10 to 35 of `benchmarks.random_loops` that are
-hard (8 of them, 400,000 and 1,500,000 evaluations, 5 keys) 39 were reliable, with 1 28."""
+to make them UNRELIABLE anyway. Of 75 calls of eight hard loops of `benchmarks.random_loops` (10 to
+35, with 400,000 and 1,500,000 evaluations, 5 keys) 39 were reliable; with a factor of 1, 28."""
 ANEW = 2.0
 """How many times as great a standard error two ways have that begin anew: the moves are twice as
 many, and half of the budget is spent."""
