@@ -561,6 +561,7 @@ def test_a_default_stress_is_made_again_where_a_known_budget_would_do(key, small
     sim = limit_state(lambda u: 1.0 - u[0], 2)
     report, again = jast.stress(key, sim), jast.stress(key, sim, 60_000)
     assert report.settings["budget"] == 60_000
+    assert report.probability.interval == again.probability.interval
     assert str(report) == str(again) and report.tried == again.tried
 
 

@@ -63,6 +63,14 @@ def row(rng, i, families, copies=1, error=0.05, sides=(-1, 1), **about):
     )
 
 
+def check_rows(rows, truth):
+    """What they say [n, 3], a value and its interval of 95 %, within 4.5 standard errors of the
+    log ``truth``.
+    """
+    half = np.diff(np.log(rows[:, 1:]), axis=1)[:, 0] / 2
+    assert (np.abs(np.log(rows[:, 0]) - truth) < 4.5 / 1.96 * half).all()
+
+
 def keys(n):
     return list(jax.random.split(jax.random.key(0), n))
 
@@ -147,11 +155,10 @@ def test_a_sweep_is_joined_wherever_its_rows_run(key, tmp_path, equal):
     truth, own = log_truth(limits, 10), np.array([r.log_mean for r in table.results])
     assert (np.log(table.probability) != own).all()
     np.testing.assert_array_equal(table.curve[:, 0], table.probability)
+    check_rows(np.column_stack([table.probability, table.interval]), truth)
     half = np.diff(np.log(table.interval), axis=1)[:, 0] / 2
-    assert (np.abs(np.log(table.probability) - truth) < 4.5 / 1.96 * half).all()
     assert (half < [1.96 * r.relative_error for r in table.results]).all()
-    half = np.diff(np.log(table.ratios[:, 1:]), axis=1)[:, 0] / 2
-    assert (np.abs(np.log(table.ratios[:, 0]) - np.diff(truth)) < 4.5 / 1.96 * half).all()
+    check_rows(table.ratios, np.diff(truth))
     assert table.episodes == sum(r.episodes for r in table.results) + table.settings["judged"]
     at = table.crossing(math.exp(truth[1]))
     assert at.interval[0] < 10.5 < at.interval[1]
@@ -179,10 +186,8 @@ def test_rows_by_plain_draws_take_part(key):
     assert plain[0] and not plain[2]
     truth = log_truth(limits, 10)
     assert np.isfinite(table.curve).all() and np.isfinite(table.ratios).all()
-    half = np.diff(np.log(table.interval), axis=1)[:, 0] / 2
-    assert (np.abs(np.log(table.probability) - truth) < 4.5 / 1.96 * half).all()
-    half = np.diff(np.log(table.ratios[:, 1:]), axis=1)[:, 0] / 2
-    assert (np.abs(np.log(table.ratios[:, 0]) - np.diff(truth)) < 4.5 / 1.96 * half).all()
+    check_rows(np.column_stack([table.probability, table.interval]), truth)
+    check_rows(table.ratios, np.diff(truth))
 
 
 @pytest.mark.long

@@ -298,17 +298,21 @@ def test_long_first_passage(horizon):
 @pytest.mark.long
 def test_first_passage_of_what_forgets_fast():
     """Some .07 effective draws a draw: 80,000 evaluations answer (10 of 10 keys), and 40,000 are at
-    the edge: 28 of 36 calls were believed, which ones hangs on a processor's rounding. No answer
-    that is believed is wrong, and what plain draws guarantee holds for all.
+    the edge: 28 of 36 calls were believed, and which ones hangs on a processor's rounding, so that
+    fewer than 4 of 10 are in 1 of 600 tries. No answer that is believed is wrong, and what plain
+    draws guarantee holds for all.
     """
     sim, truth = autoregression(0.4, 5.5, 100), autoregression_probability(0.4, 5.5, 100)
     for k in range(3):
-        edge = failure_probability(jax.random.key(k), sim, 40_000)
-        low, high = edge.guaranteed
-        assert low <= truth <= high, str(edge)
-        if edge.reliable:
-            check_estimate(edge, truth, budget=40_000)
         check_estimate(failure_probability(jax.random.key(k), sim, 80_000), truth, budget=80_000)
+    answers = [failure_probability(jax.random.key(k), sim, 40_000) for k in range(10)]
+    believed = [found for found in answers if found.reliable]
+    assert len(believed) >= 4, "\n".join(map(str, answers))
+    for found in believed:
+        check_estimate(found, truth, budget=40_000)
+    for found in answers:
+        low, high = found.guaranteed
+        assert low <= truth <= high, str(found)
 
 
 @pytest.mark.slow

@@ -220,7 +220,7 @@ def times_too_few(found: Estimate) -> float:
     is not known, and 1 for every other one.
     """
     first = "".join(found.warnings[:1])
-    if not found.reliable and first.startswith(UNCONFIRMED):
+    if first.startswith(UNCONFIRMED):
         return math.inf
     # an interrupted one of plain draws is reliable, with a warning
     imprecise = first.startswith(IMPRECISE) or found.reliable and not first

@@ -184,10 +184,10 @@ def by_populations(
         kinds, by_weights = () if plain else search.choose_kinds(), None
         if kinds:
             kinds = search.compare(kinds)
-            plain = not search.agree(kinds) and search.plain_answers(kinds)
-            if len(kinds) == 2 and not (plain or search.interrupted):
+            settled = search.agree(kinds) or not search.plain_answers(kinds)
+            if len(kinds) == 2 and settled and not search.interrupted:
                 by_weights = importance_estimate(search, name, kinds, level)
-            plain = plain or by_weights is None and search.plain_answers()
+            plain = by_weights is None and search.plain_answers(kinds)
         if plain or not kinds:
             return estimate_from_plain_draws(search, name, level)
         if by_weights is None:

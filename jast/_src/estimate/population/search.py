@@ -245,9 +245,7 @@ class PopulationSearch:
             self.fill(kinds[1], min(share, self.budget - self.spent))
             doubled = tuple(k.doubled for k in kinds)
             cost = self.n * sum(map(self.cost, doubled))
-            if self.agree(kinds) or self.plain_answers(kinds):
-                return kinds
-            if self.spent + cost > self.budget:
+            if self.agree(kinds) or self.plain_answers(kinds) or self.spent + cost > self.budget:
                 return kinds
             for kind in doubled:
                 self.run(kind, 1)
