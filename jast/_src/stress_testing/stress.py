@@ -254,7 +254,10 @@ def _stress_once(key, sim, budget, *, top, progress, callback, checkpoint, place
                     test.run_populations()
                     more = budgets.next_budget(test.probability, budget) if by_default else None
                     if more is None:
-                        with briefly(True):  # what it compiles plays some ten thousand episodes
+                        # draws of Gaussians and of the model have compiled the program that this
+                        # plays some ten thousand episodes with; populations have not
+                        drawn = test.probability.draws
+                        with briefly(drawn is not None and isinstance(drawn.source, Sample)):
                             test.find_likeliest()
                 else:
                     test.search()
