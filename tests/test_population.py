@@ -346,6 +346,18 @@ def test_nothing_more_is_run_after_an_interruption(slow_chains):
     assert search.compare(kinds) == kinds and ran == before
 
 
+def test_one_way_that_nothing_confirms_gives_way_to_plain_draws(slow_chains):
+    """It would be UNRELIABLE. 20 failures are expected among 2e7 draws of 1e-6, which tell it to 22
+    %; 5 among 5e6.
+    """
+    search, _ = slow_chains
+    kind = search.first_kind("distance")
+    search.budget = 2 * 10**7
+    assert search.plain_answers((kind,)) and not search.plain_answers((kind, kind))
+    search.budget = 5 * 10**6
+    assert not search.plain_answers((kind,))
+
+
 def test_what_misleads_the_distance_is_not_missed_silently(key):
     """Levels of the distance see one branch alone, which has a thousandth of the probability."""
     found = population(key, BRANCHES, 400_000, particles=N)

@@ -75,8 +75,9 @@ def population(
     failures, its moves are doubled until its answer stays. The model's own draws,
     with which each population begins, are a third witness. Otherwise the estimate is UNRELIABLE and
     says which way saw what; so it is with a relative standard error above 5 %, and with coarse
-    floats. Where plain draws promise more than these, it draws plainly: their interval is exact,
-    and they are UNRELIABLE with fewer than ten failures only.
+    floats. Where plain draws promise more than these, or ten failures while nothing confirms what
+    one way says, it draws plainly: their interval is exact, and they are UNRELIABLE with fewer than
+    ten failures only.
 
     A failure mode that no way meets is missing without a sign. A KeyboardInterrupt ends it with the
     estimate of the populations that are done, and is raised where there is none. Host loop, not for

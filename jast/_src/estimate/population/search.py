@@ -43,7 +43,7 @@ WITNESS_SHARE = 1 / 3
 ENOUGH_PLAIN_FAILURES = 1000
 """Failures among plain draws that tell a probability to 3 %: then they are all that is drawn."""
 MIN_PLAIN_FAILURES = 10
-"""Failures among the first plain draws from which the probability is roughly known."""
+"""Failures among plain draws from which the probability is roughly known."""
 MAX_PLAIN_ERROR = 0.2
 """Relative standard error that plain draws promise at most: 25 failures expected, of which chance
 leaves fewer than the ten of a plain answer (`estimate.MIN_COUNTED_FAILURES`) once in 4500."""
@@ -198,10 +198,12 @@ class PopulationSearch:
 
     def plain_answers(self, compared=()):
         """Whether plain draws answer, and more exactly than populations promise to: those that were
-        ``compared`` and do not agree would have to begin anew.
+        ``compared`` and do not agree would have to begin anew, and one alone is not confirmed.
         """
         if self.interrupted or not self.reached():
             return False
+        if len(compared) == 1:  # UNRELIABLE, however exact it becomes
+            return self.plain_error() <= MIN_PLAIN_FAILURES**-0.5
         promised, times = self.promised_error(), 1.0
         if not self.agree(compared):
             times = ANEW
