@@ -170,7 +170,7 @@ def _families(request):
 def _has_many_steps(request):
     """Whether the system has many steps, or choices: tilts are then tried first."""
     about, horizon = shape(request.sim), request.sim.horizon
-    return about.choices or about.choices0 or horizon >= request.settings.tilts_first_horizon
+    return about.has_choices or horizon >= request.settings.tilts_first_horizon
 
 
 def _search_moments(request, context):
@@ -232,7 +232,7 @@ def _descend_to_tilts(f, request, state, room):
     state = descend_levels(f, replay_given(f, state, request.failures), end)
     if state.q is not None:
         state = adapt_proposal(f, state, settings.refits, end)
-        single = f.components_each == 1 and f.about.normals
+        single = f.components_each == 1 and f.about.steps.normals
         if single and state.efficiency < settings.single_efficiency:
             f, before = f._replace(components_each=settings.components_each), state.spent
             state = state._replace(q=f.refit(state)["refitted"])

@@ -39,7 +39,7 @@ def descend_levels(f: TiltFamily, state: SearchState, end: float) -> SearchState
     in all; without a proposal where it reached no failure.
     """
     q, level, s = f.untilted(), math.inf, f.settings
-    if f.about.choices or f.about.choices0:
+    if f.about.has_choices:
         floor = math.log(min(s.raised_choices / f.sim.horizon, s.raised_probability_most))
         q = Mixture([f.model, f.model._replace(floor=floor)], [0.5, 0.5], q.frame)
     while state.spent + f.batch <= end:

@@ -104,8 +104,8 @@ class TiltFamily(NamedTuple):
     @property
     def batch(self) -> int:
         """Episodes of a batch: fewer where they are so long that memory would not hold them."""
-        a = self.about
-        a_step = a.seen + a.normals + a.choices * (1 + a.categories)
+        normals, choices, categories, _ = self.about.steps
+        a_step = self.about.seen + normals + choices * (1 + categories)
         most = HELD / (a_step * self.sim.horizon) + LEAST_BATCH
         small = min(self.budget // BATCHES_OF_SMALL, SMALL_BATCH)
         return int(min(max(self.budget // BATCHES, small), most))
@@ -142,8 +142,7 @@ class TiltFamily(NamedTuple):
         """A batch of ``q``."""
         n, a, rng = self.batch, self.about, self.context.rng
         draw = partial(step_numbers, rng, normal_numbers(self.sim), precision=np.float32)
-        first = draw(a.normals0, a.choices0, n)
-        noise = draw(a.normals, a.choices, self.sim.horizon, n)
+        first, noise = draw(a.first, n), draw(a.steps, self.sim.horizon, n)
         u = rng.random(n).astype(normal_numbers(self.sim))
         tilts = self.on_device(q)
         o, ratio, trace = simulate_tilts(self.sim, tilts, u, first, noise)

@@ -142,7 +142,7 @@ def steps_of(
     x = features(frame, trace.seen[at, t].astype(dtype), tau, np)
     first = np.ones((n, 1), dtype), np.arange(n), *trace[:3]
     steps = x, at, *(a[at, t] for a in (trace.normals, trace.choices, trace.log_p))
-    return _rows(about.owners0, *first), _rows(about.owners, *steps)
+    return _rows(about.first.owners, *first), _rows(about.steps.owners, *steps)
 
 
 def _rows(owners, x, trace, normals, choices, log_p):
@@ -357,15 +357,13 @@ def _log_ratio(block, rows, floor):
 def model_tilt(about: Shape, count: int, components_each: int) -> Tilt:
     """The model as a `Tilt` of ``count`` features, and of so many Gaussians for each number."""
 
-    def block(f, normals, choices, categories, owners):
+    def block(f, numbers):
+        normals, choices, categories, owners = numbers
         owning = categories if any(o >= 0 for o in owners) else 1
-        numbers = np.zeros((f, owning, normals, components_each))
-        return Block(numbers, numbers, np.zeros((f + 3, choices, categories)), numbers[0])
+        none = np.zeros((f, owning, normals, components_each))
+        return Block(none, none, np.zeros((f + 3, choices, categories)), none[0])
 
-    return Tilt(
-        block(1, about.normals0, about.choices0, about.categories0, about.owners0),
-        block(count, about.normals, about.choices, about.categories, about.owners),
-    )
+    return Tilt(block(1, about.first), block(count, about.steps))
 
 
 def scale_tilt(tilt: Tilt, by: float) -> Tilt:

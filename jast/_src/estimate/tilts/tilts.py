@@ -29,6 +29,7 @@ from jast._src.normal_space.transform import normal_numbers, outcomes_of
 from jast._src.runtime._jax import jit
 from jast._src.runtime.checkpoints import answer_once
 from jast._src.runtime.host_errors import runs_on_host
+from jast._src.util.pytrees import select
 
 __all__ = [
     "Block",
@@ -110,20 +111,26 @@ class Tilts(NamedTuple):
     frame: Frame
 
 
-class Shape(NamedTuple):
-    """How many numbers a start and a step have: normals, choices, categories, and the choices that
-    normals belong to; and what is seen.
-    """
+class Numbers(NamedTuple):
+    """How many numbers a start or a step has, and the choices that its normal numbers belong to."""
 
-    normals0: int
-    choices0: int
-    categories0: int
-    owners0: tuple[int, ...]
     normals: int
     choices: int
     categories: int
     owners: tuple[int, ...]
+
+
+class Shape(NamedTuple):
+    """The `Numbers` of a start and of a step, and how many are seen of a state."""
+
+    first: Numbers
+    steps: Numbers
     seen: int
+
+    @property
+    def has_choices(self) -> bool:
+        """Whether the start or a step has."""
+        return bool(self.first.choices or self.steps.choices)
 
 
 class Trace(NamedTuple):
@@ -148,20 +155,11 @@ class Trace(NamedTuple):
 @per_simulator
 def shape(sim: Any, start: Any, state: Any, dist: Any) -> Shape:
     """The `Shape` of a simulator."""
-    a, b = parts(start), parts(dist)
-    choices0, categories0 = stack_choices(a).shape
-    choices, categories = stack_choices(b).shape
-    return Shape(
-        normals0=a.normals,
-        choices0=choices0,
-        categories0=categories0,
-        owners0=a.owners,
-        normals=b.normals,
-        choices=choices,
-        categories=categories,
-        owners=b.owners,
-        seen=len(tilt_inputs(sim, state)),
-    )
+
+    def count(p):
+        return Numbers(p.normals, *stack_choices(p).shape, p.owners)
+
+    return Shape(count(parts(start)), count(parts(dist)), len(tilt_inputs(sim, state)))
 
 
 def stack_choices(p: Parts) -> jax.Array:
@@ -390,18 +388,17 @@ def _simulate(sim, q, u, first, noise):
         x, *row, gain = _draw_step(p, k, f, q.steps, q.floors, numbers)
         after = advance(sim, density, progress, x, t + 1 >= horizon)
         done = progress.done
-        after, ratio = jax.tree.map(
-            lambda old, new: jnp.where(done, old, new), (progress, ratio), (after, ratio + gain)
-        )
+        after, ratio = select(done, (progress, ratio), (after, ratio + gain))
         return after, ratio, length + jnp.where(done, 0, 1), (seen, *row)
 
     progress, ratio, first_rows = jax.vmap(start)(k, *first)
     n = len(u)
+    normals, choices, categories, _ = about.steps
     rows = (
         jnp.zeros((horizon, n, about.seen), u.dtype),
-        jnp.zeros((horizon, n, about.normals), u.dtype),
-        jnp.zeros((horizon, n, about.choices), jnp.int32),
-        jnp.zeros((horizon, n, about.choices, about.categories), u.dtype),
+        jnp.zeros((horizon, n, normals), u.dtype),
+        jnp.zeros((horizon, n, choices), jnp.int32),
+        jnp.zeros((horizon, n, choices, categories), u.dtype),
     )
 
     def body(carry):
@@ -432,25 +429,26 @@ def random_numbers(key, n, about, horizon, dtype):
     """
     rng = numpy_generator(key)
     u = rng.random(n).astype(dtype)
-    first = step_numbers(rng, dtype, about.normals0, about.choices0, n)
-    return u, first, step_numbers(rng, dtype, about.normals, about.choices, horizon, n)
+    first = step_numbers(rng, dtype, about.first, n)
+    return u, first, step_numbers(rng, dtype, about.steps, horizon, n)
 
 
-def step_numbers(rng, dtype, normals, choices, *size, precision=np.float64):
+def step_numbers(rng, dtype, numbers, *size, precision=np.float64):
     """Normal numbers, uniform ones of their Gaussians, and uniform ones of choices, which are drawn
     of 64 bits: fine near 0, where rare categories lie.
     """
     drawn = (
-        rng.standard_normal((*size, normals), precision),
-        rng.random((*size, normals), precision),
-        rng.random((*size, choices)),
+        rng.standard_normal((*size, numbers.normals), precision),
+        rng.random((*size, numbers.normals), precision),
+        rng.random((*size, numbers.choices)),
     )
     return tuple(v.astype(dtype) for v in drawn)
 
 
 def dimension(about: Shape, horizon: int) -> int:
     """How many numbers of chance an episode has at most."""
-    return about.normals0 + about.choices0 + horizon * (about.normals + about.choices)
+    first, steps, _ = about
+    return first.normals + first.choices + horizon * (steps.normals + steps.choices)
 
 
 def simulate_points(sim, q, z):
@@ -464,11 +462,15 @@ def simulate_points(sim, q, z):
 @jit
 def _simulate_points(sim, q, z):
     about = shape(sim)
-    a, b = about.normals0, about.choices0
-    first = z[:, :a], jnp.zeros_like(z[:, :a]), ndtr(z[:, a : a + b])
-    rest = jnp.moveaxis(z[:, a + b :].reshape(len(z), sim.horizon, -1), 0, 1)
-    e = rest[..., : about.normals]
-    noise = e, jnp.zeros_like(e), ndtr(rest[..., about.normals :])
+
+    def numbers_of(z, normals):
+        e = z[..., :normals]
+        return e, jnp.zeros_like(e), ndtr(z[..., normals:])
+
+    n = about.first.normals + about.first.choices
+    first = numbers_of(z[:, :n], about.first.normals)
+    rest = jnp.moveaxis(z[:, n:].reshape(len(z), sim.horizon, -1), 0, 1)
+    noise = numbers_of(rest, about.steps.normals)
     o, ratio, trace = _simulate(sim, q, jnp.zeros(len(z), z.dtype), first, noise)
     return o, logsumexp(ratio + q.log_weights[None], axis=1), trace
 
