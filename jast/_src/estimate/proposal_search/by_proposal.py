@@ -79,6 +79,11 @@ class Request(NamedTuple):
     steps and tilts do not serve. In the 400 numbers of a cart-pole Gaussians took seven tenths of
     the time, and had an effective draw or two of 4000."""
 
+    @property
+    def differentiable(self) -> bool:
+        """Whether gradients of the miss distance are wanted, and there are any."""
+        return self.gradients and not runs_on_host(self.sim)
+
 
 class Search(NamedTuple):
     """A family of proposals, and what its search knows."""
@@ -131,10 +136,16 @@ def _answer(request, context, reasons):
     state, rest = first.state, request._replace(budget=request.budget - first.state.spent)
     if serves or rest.budget < s.moments_alone_budget:
         return _draw(request, _audit(first) if serves else first, reasons)
-    found = _draw(rest, _search(rest, context), reasons)
-    plain = tuple(a + b for a, b in zip(found.plain or (0, 0, 0), state.plain, strict=True))
-    history = *state.history, *found.history
-    return found._replace(episodes=found.episodes + state.spent, history=history, plain=plain)
+    return _after(state, _draw(rest, _search(rest, context), reasons))
+
+
+def _after(state, found):
+    """The `Estimate` that was ``found`` with what a search had left, which came to ``state``."""
+    return found._replace(
+        episodes=state.spent + found.episodes,
+        history=(*state.history, *found.history),
+        plain=tuple(a + b for a, b in zip(state.plain, found.plain or (0, 0, 0), strict=True)),
+    )
 
 
 def _search(request, context):
@@ -176,8 +187,7 @@ def _has_many_steps(request):
 def _search_moments(request, context):
     """The `Search` for Gaussians beyond the boundary of each moment, from few runs."""
     f = GaussianFamily(request.sim, request.budget, context, FEW_RUNS, "moments")
-    gradients = request.gradients and not runs_on_host(request.sim)
-    return Search(f, explore_moments(f, request.failure_points, gradients))
+    return Search(f, explore_moments(f, request.failure_points, request.differentiable))
 
 
 def _search_gaussians(request, context, state):
@@ -192,8 +202,7 @@ def _search_gaussians(request, context, state):
         if is_efficient(near, settings.near_fitted_efficiency):
             return Search(f, near)
         state = near._replace(q=None, anchors=None)
-    gradients = request.gradients and not runs_on_host(request.sim)
-    state = explore_failures(f, state, request.failure_points, gradients)
+    state = explore_failures(f, state, request.failure_points, request.differentiable)
     if state.q is not None:
         end = max(end, state.spent + LEAST_BATCHES * f.batch)
         state = adapt_proposal(f, state, settings.refits, end)
@@ -220,8 +229,7 @@ def _search_tilts(request, context, state):
 def _search_mixed_tilts(request, context, state):
     """The `Search` for tilts of several Gaussians, with a part of what is left."""
     settings = request.settings
-    f = TiltFamily(request.sim, request.budget, context, settings)
-    f = f._replace(components_each=settings.components_each)
+    f = TiltFamily(request.sim, request.budget, context, settings, settings.components_each)
     room = settings.tilts_share_after * (request.budget - state.spent)
     return _descend_to_tilts(f, request, state, room)
 
@@ -272,17 +280,11 @@ def _draw(request, search, reasons):
     often = math.exp(min(state.log_p, 0.0)) * n >= request.settings.plain_failures
     about_proposal = [*reasons, *state.reasons]
     if not (search.suffices or often) and request.otherwise and _has_many_steps(request):
-        found = request.otherwise(n)
-        return found._replace(
-            episodes=state.spent + found.episodes,
-            history=(*state.history, *found.history),
-            plain=tuple(map(sum, zip(state.plain, found.plain, strict=True))),
-        )
+        return _after(state, request.otherwise(n))
     if not search.suffices and not often and state.log_p > -math.inf:
         found = fallback_estimate(key, sim, n, state.log_p, level, about_proposal or [UNUSABLE])
         if found is not None:
-            spent, history = state.spent + found.episodes, (*state.history, *found.history)
-            return found._replace(episodes=spent, history=history, plain=state.plain)
+            return _after(state, found)
     if search.suffices or (search.efficiency and not often):
         against = about_proposal if search.suffices else [*about_proposal, UNUSABLE]
         return _draw_proposal(request, search, watch, against)
