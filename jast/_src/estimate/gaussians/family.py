@@ -141,11 +141,15 @@ class GaussianFamily(NamedTuple):
 
     def add(self, state: SearchState, g: Gaussians, share: float | None) -> SearchState:
         """The proposal with the `Gaussians` ``g`` for ``share`` of it; None: in place of it."""
-        parts = defensive_parts(
-            g, self.settings.variance_least, _is_rare(self, state), self.settings
-        )
-        new = as_latent(parts, self.dtype)
+        new = self.defensive(state, g, self.settings.variance_least)
         return state._replace(q=new if share is None else mix(state.q, new, share))
+
+    def defensive(self, state: SearchState, g: Gaussians, least: float = 0.0) -> transform.Latent:
+        """The `Latent` of the `defensive_parts` of ``g``, with the model unless failures are rare,
+        as far as anything tells.
+        """
+        rare = state.log_p < math.log(self.settings.rare_probability)
+        return as_latent(defensive_parts(g, least, rare, self.settings), self.dtype)
 
     def of_population(self, points: Points) -> Gaussians:
         """`Gaussians` fitted to a population."""
@@ -188,11 +192,6 @@ class GaussianFamily(NamedTuple):
         return choices
 
 
-def _is_rare(family: GaussianFamily, state: SearchState) -> bool:
-    """Whether failures are, as far as anything tells."""
-    return state.log_p < math.log(family.settings.rare_probability)
-
-
 def _fit_by_owner(f, state, points, owner):
     """A `Latent`: Gaussians fitted to the points of each owner apart."""
     log_w, owners = state.log_weight, np.unique(owner)
@@ -218,8 +217,7 @@ def _fit_by_owner(f, state, points, owner):
             anchors=state.anchors,
         )
         parts.append(g._replace(weights=g.weights * max(mass, least)))
-    all_parts = Gaussians(*map(np.concatenate, zip(*parts, strict=True)))
-    return as_latent(defensive_parts(all_parts, 0.0, _is_rare(f, state), s), f.dtype)
+    return f.defensive(state, Gaussians(*map(np.concatenate, zip(*parts, strict=True))))
 
 
 def _fit_sparse(f, state, points, centres):
@@ -252,8 +250,7 @@ def _fit_sparse(f, state, points, centres):
     # shares as if each direction had been drawn `share_prior` times more
     n, prior = effective_sample_size(log_w), f.settings.share_prior
     shares = (n * masses / masses.sum() + prior) / (n + len(masses) * prior)
-    g = Gaussians(shares, means, values, vectors)
-    return as_latent(defensive_parts(g, 0.0, _is_rare(f, state), f.settings), f.dtype)
+    return f.defensive(state, Gaussians(shares, means, values, vectors))
 
 
 def defensive_parts(
