@@ -41,7 +41,11 @@ def redraw(key: Any, sim: Any, q: Any, n: int) -> tuple[np.ndarray, Outcomes, np
     A choice that was made without a normal number has the middle of its interval as one. Of a
     `Sample` its own failures come back, chosen by weight, and nothing is run.
     """
-    return _REDRAW[type(q)](key, sim, q, n)
+    if isinstance(q, Sample):
+        return _choose_failures(key, sim, q, n)
+    if isinstance(q, tilts.Tilts):
+        return _redraw_tilts(key, sim, q, n)
+    return draw_mixture(sim, q, *random_numbers(key, n, q.means.shape[1], q.means.dtype))[:3]
 
 
 def is_proposal_of(sim: Any, q: Any) -> bool:
@@ -116,10 +120,6 @@ def sample_of_draws(sim: Any, draws: Draws, most: int) -> Sample:
     )
 
 
-def _redraw_gaussians(key, sim, q, n):
-    return draw_mixture(sim, q, *random_numbers(key, n, q.means.shape[1], q.means.dtype))[:3]
-
-
 def _redraw_tilts(key, sim, q, n):
     about, dtype = tilts.shape(sim), transform.normal_numbers(sim)
     chance = tilts.random_numbers(key, n, about, sim.horizon, dtype)
@@ -139,13 +139,6 @@ def _choose_failures(key, sim, sample, n):
         invalid=np.zeros(n, bool),
     )
     return sample.points[rows], o, np.zeros(n)
-
-
-_REDRAW = {
-    transform.Latent: _redraw_gaussians,
-    tilts.Tilts: _redraw_tilts,
-    Sample: _choose_failures,
-}
 
 
 @jit

@@ -13,8 +13,11 @@ from jast._src.core.simulator import Simulator
 from jast._src.estimate import diagnostics
 from jast._src.estimate.estimate import Estimate, estimate_from_weights
 from jast._src.estimate.importance_sampling import Traces, chunks
-from jast._src.estimate.proposal_search import mixture_draws
-from jast._src.estimate.proposal_search.mixture_draws import component_numbers, numbers_of_chunk
+from jast._src.estimate.proposal_search.mixture_draws import (
+    component_numbers,
+    draw_mixture,
+    numbers_of_chunk,
+)
 from jast._src.estimate.tilts import tilts
 from jast._src.estimate.tilts.tilts import Tilts
 from jast._src.estimate.weighted_draws import with_source
@@ -119,8 +122,10 @@ def _traces(shared, i, context):
     """`Traces` of chunk ``i`` of ``q``; ``members`` [K, K]: of which modes the shares are."""
     key, sim, q, members, lanes, samples = shared
     n = min(lanes, samples - i * lanes)
-    draw = _draw_tilts if isinstance(q, Tilts) else _draw_gaussians
-    o, log_w, shares = draw(key, sim, q, i, n, lanes)
+    if isinstance(q, Tilts):
+        o, log_w, shares = _draw_tilts(key, sim, q, i, n, lanes)
+    else:
+        _, o, log_w, shares = draw_mixture(sim, q, *numbers_of_chunk(key, i, n, q))
     with np.errstate(divide="ignore"):
         shares = np.log(np.exp(shares) @ members)
     return Traces(
@@ -133,13 +138,8 @@ def _traces(shared, i, context):
     )
 
 
-def _draw_gaussians(key, sim, q, i, n, lanes):
-    """(`Outcomes`, log p - log q, log shares [n, K]) of the first ``n`` draws of chunk ``i``."""
-    return mixture_draws.draw_mixture(sim, q, *numbers_of_chunk(key, i, n, q))[1:]
-
-
 def _draw_tilts(key, sim, q, i, n, lanes):
-    """The same of tilts."""
+    """(`Outcomes`, log p - log q, log shares [n, K]) of the first ``n`` draws of chunk ``i``."""
     about, dtype = tilts.shape(sim), transform.normal_numbers(sim)
     u, first, noise = tilts.random_numbers(
         numpy_generator(key, TILTS, i), lanes, about, sim.horizon, dtype
