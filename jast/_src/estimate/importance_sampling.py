@@ -253,9 +253,10 @@ def of_policies(shared, i, context):
 
 
 @partial(jit, static_argnames=("n", "to_horizon"))
-def traces(key, sim, proposal, n, to_horizon=False):
-    """`log_weights` without its checks."""
-    return jax.vmap(lambda k: one_trace(k, sim, proposal, to_horizon))(jax.random.split(key, n))
+def traces(key, sim, proposal, n, to_horizon=False, drawn=None):
+    """`log_weights` without its checks; ``drawn`` as of `one_trace`."""
+    keys = jax.random.split(key, n)
+    return jax.vmap(lambda k: one_trace(k, sim, proposal, to_horizon, drawn))(keys)
 
 
 def one_trace(key, sim, proposal, to_horizon=False, drawn=None, start_key=None):
@@ -340,15 +341,9 @@ def draw_episodes(key, sim, proposal, n):
     return jax.vmap(one)(jax.random.split(key, n))
 
 
-@partial(jit, static_argnums=3)
-def _probe(key, sim, proposal, n):
-    drawn = nominal_policy(sim)
-    return jax.vmap(lambda k: one_trace(k, sim, proposal, False, drawn))(jax.random.split(key, n))
-
-
 def _uncovered(key, sim, proposal):
     """Why the proposal cannot be right, tried on episodes of the model."""
-    seen = jax.device_get(_probe(key, sim, proposal, PROBES))
+    seen = jax.device_get(traces(key, sim, proposal, PROBES, drawn=nominal_policy(sim)))
     missing = int((~seen.invalid & ~(seen.log_weight < np.inf)).sum())
     said = (
         f"the proposal has density 0 on {missing} of {PROBES} of the model's own episodes: failures"
