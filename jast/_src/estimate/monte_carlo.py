@@ -32,7 +32,7 @@ from jast._src.util.checks import check_random_key, whole_number
 from jast._src.util.display import call_settings
 from jast._src.util.intervals import checked_level
 
-__all__ = ["episode_keys", "lanes_of_points", "monte_carlo", "simulate_points"]
+__all__ = ["episode_keys", "lanes_of_points", "monte_carlo", "plain_traces", "simulate_points"]
 
 CHUNK_EPISODES = 16384
 """Episodes of a unit of work that are drawn by keys: a second of a cheap system, or less."""
@@ -121,7 +121,7 @@ def simulate_points(shared: tuple[Any, ...], i: int, context: Any) -> Traces:
         parts = enumerate(plain_parts(key, i, n, sim))
         found = [evaluate_on_device(sim, z, min(m, n - j * m)) for j, z in parts]
         o = jax.tree.map(lambda *a: np.concatenate(a), *found)
-    return _plain_traces(o.failure, o.invalid, o.length, o.distance)
+    return plain_traces(o.failure, o.invalid, o.length, o.distance)
 
 
 def episode_keys(key: jax.Array, chunk: int, rows: np.ndarray) -> jax.Array:
@@ -136,11 +136,11 @@ def _simulate_keys(shared, i, context):
     # of a system on the host no episode is run in vain
     size = n if runs_on_host(sim) else block_size(CHUNK_EPISODES)
     out = jax.device_get(_simulate_chunk(jax.random.fold_in(key, i), sim, np.int32(n), size))
-    return _plain_traces(*(a[:n] for a in out))
+    return plain_traces(*(a[:n] for a in out))
 
 
-def _plain_traces(failure, invalid, length, distance):
-    """`Traces` of which all weights are 1."""
+def plain_traces(failure, invalid, length, distance=None):
+    """`Traces` [n] of which all weights are 1, of NumPy's arrays."""
     log_weight = np.zeros(len(failure))
     return Traces(
         log_weight=log_weight,

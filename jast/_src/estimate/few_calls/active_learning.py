@@ -22,6 +22,7 @@ from jast._src.estimate.few_calls.surrogate import (
     probability_below_zero,
 )
 from jast._src.estimate.few_calls.surrogate_pool import DOUBT, Pool, expected, pool
+from jast._src.estimate.gaussians.mixture_fit import nearest_centre
 from jast._src.normal_space import transform
 from jast._src.runtime.checkpoints import answer_once
 from jast._src.runtime.progress_bar import Watch
@@ -70,16 +71,14 @@ class Learner:
 
     def call(self, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Failures and invalid episodes [n] of the system at ``z`` [n, D], which are recorded."""
-        outcomes = []
+        before = len(self.z)
         for i in range(0, len(z), self.batch):
             rows = np.asarray(z[i : i + self.batch], self.dtype)
             o = answer_once(self._simulate, rows)
-            outcomes.append(o)
             self.spent, self.steps = self.spent + len(rows), self.steps + int(o.length.sum())
             self.record(rows, o.distance, o.failure, o.invalid)
             self.watch.more(len(rows))
-        failure, invalid = zip(*((o.failure, o.invalid) for o in outcomes), strict=True)
-        return np.concatenate(failure), np.concatenate(invalid)
+        return self.failing[before:], self.invalid[before:]
 
     def _simulate(self, rows):
         return transform.outcomes(self.sim, jnp.asarray(rows))
@@ -159,7 +158,7 @@ def _least_doubt(learner, n):
     _, p = expected(surrogate, candidates.z)
     doubt = candidates.weights * np.sqrt(p * (1 - p)) + TINY
     if learner.invalid.any():  # nothing is learned there
-        doubt = np.where(learner.invalid[_nearest(candidates.z, learner.z)], TINY, doubt)
+        doubt = np.where(learner.invalid[nearest_centre(candidates.z, learner.z)], TINY, doubt)
     rows = rng.choice(len(p), TRIED, p=doubt / doubt.sum())
     rows = np.unique(np.concatenate([rows, rng.choice(len(p), learner.batch, replace=False)]))
     z = candidates.z[rows]
@@ -181,8 +180,3 @@ def _least_doubt(learner, n):
         chosen.append(best)
         c = c - np.outer(c[:, best], c[:, best]) / variance[best]
     return z[chosen]
-
-
-def _nearest(z, others):
-    """The number [n] of the nearest of ``others`` [m, D] to each of ``z`` [n, D]."""
-    return np.argmin((others**2).sum(axis=1) - 2 * z @ others.T, axis=1)

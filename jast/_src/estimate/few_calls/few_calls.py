@@ -20,11 +20,11 @@ from jast._src.estimate.estimate import MAX_INVALID_SHARE, Estimate, estimate_fr
 from jast._src.estimate.few_calls.active_learning import CANDIDATES, Learner, choose_calls
 from jast._src.estimate.few_calls.surrogate_pool import expected
 from jast._src.estimate.gaussians.design_points import distinct
-from jast._src.estimate.importance_sampling import Traces
+from jast._src.estimate.monte_carlo import plain_traces
 from jast._src.normal_space.transform import Latent
 from jast._src.runtime._jax import was_interrupted
 from jast._src.runtime.progress_bar import Watch
-from jast._src.util.intervals import log_normal
+from jast._src.util.intervals import log_normal, normal_quantile
 
 __all__ = ["LEAST", "few_calls"]
 
@@ -208,9 +208,7 @@ def _interval(mean, error, level, unseen):
     """
     if 0 < error < mean:
         return log_normal(math.log(mean), error / mean, level)
-    from scipy.special import ndtri  # here: slow to import
-
-    above = max(mean, 0.0) + float(ndtri((1 + level) / 2)) * error
+    above = max(mean, 0.0) + normal_quantile(level) * error
     return 0.0, min(max(above, unseen), 1.0)
 
 
@@ -218,14 +216,7 @@ def _plain(learner, level):
     """The `Estimate` of a system that has not failed: the rest are draws of the model."""
     n = learner.budget - learner.spent
     failing, invalid = learner.call(learner.rng.standard_normal((n, learner.dimension)))
-    none = np.zeros(n)
-    seen = Traces(
-        log_weight=none,
-        shares=none[:, None],
-        failure=failing,
-        invalid=invalid,
-        length=none.astype(int),
-    )
+    seen = plain_traces(failing, invalid, np.zeros(n, int))
     learner.history.append(f"plain draws: {n} calls, {int(failing.sum())} failures")
     return estimate_from_counts(
         NAME,
