@@ -12,7 +12,7 @@ from jast._src.estimate import diagnostics
 from jast._src.estimate.weight_sums import Sums, mode_shares, moments
 from jast._src.estimate.weighted_draws import Draws
 from jast._src.util import display
-from jast._src.util.intervals import checked_level, chernoff, clopper_pearson, jeffreys, log_normal
+from jast._src.util.intervals import chernoff, clopper_pearson, jeffreys, log_normal
 
 __all__ = [
     "MAX_INVALID_SHARE",
@@ -290,20 +290,14 @@ def estimate_from_weights(
     own draws. ``plain``: (failing, invalid, episodes) of such draws beside those of ``sums``.
     ``min_ess``: effective draws, of fewer than which it is UNRELIABLE.
     """
-    level, n = checked_level(method, level), sums.samples
+    n = sums.samples
     plain = tuple(a + b for a, b in zip(sums.plain, plain, strict=True))
     found = list(reasons)
     if sums.undefined:
         found.append(f"{sums.undefined} failing episodes have a weight that is NaN or infinite")
     found += _invalid_warnings(sums.invalid, sums.invalid_first, sums.first)
     about |= dict(
-        failing=sums.failures,
-        samples=n,
-        episodes=n if evaluations is None else evaluations,
-        steps=sums.steps,
-        invalid=sums.invalid,
         unseen=-math.log1p(-level) / control if control else None,
-        draws=sums.draws,
         plain=plain if plain[-1] else None,
     )
     log_mean = relative = math.nan
@@ -329,8 +323,7 @@ def estimate_from_weights(
             )
         mode_intervals = _mode_intervals(log_mean, modes, sizes, n, level)
         about |= dict(k_hat=k_hat, max_share=share, modes=modes, mode_intervals=mode_intervals)
-    warnings = (*found, *_invalid_remarks(sums), *notes)
-    about |= dict(ess=ess, reliable=not found, warnings=warnings)
+    about |= dict(ess=ess) | _fields_of_sums(sums, evaluations, found, notes)
     return estimate_from_mean(method, log_mean, relative, level, interval, **about)
 
 
@@ -347,7 +340,6 @@ def estimate_from_counts(
     """The `Estimate` of episodes of the model itself: exact interval and upper bounds. Arguments as
     of `estimate_from_weights`.
     """
-    level = checked_level(method, level)
     n, k = sums.samples, sums.failures
     mean, found = k / n if k else math.nan, list(reasons)
     if k == 0:
@@ -365,20 +357,29 @@ def estimate_from_counts(
         mean=mean,
         ess=float(k),
         max_share=1 / k if k else math.nan,
-        failing=k,
-        samples=n,
-        episodes=n if evaluations is None else evaluations,
-        steps=sums.steps,
-        invalid=sums.invalid,
         modes=np.ones(1) if k else None,
-        reliable=not found,
-        warnings=(*found, *_invalid_remarks(sums), *notes),
         chernoff=chernoff(k, n, level),
         jeffreys=jeffreys(k, n, level),
         mode_intervals=np.array([interval]) if k else None,
-        draws=sums.draws,
         plain=(k, sums.invalid, n),
+        **_fields_of_sums(sums, evaluations, found, notes),
         **about,
+    )
+
+
+def _fields_of_sums(sums, evaluations, reasons, notes):
+    """What every `Estimate` of `Sums` holds: their counts, the ``reasons`` against it, remarks."""
+    invalid = "episodes are invalid (a number that is not finite) and count as not failing"
+    remarks = [f"{sums.invalid} of {sums.samples} {invalid}"] if sums.invalid else []
+    return dict(
+        failing=sums.failures,
+        samples=sums.samples,
+        episodes=sums.samples if evaluations is None else evaluations,
+        steps=sums.steps,
+        invalid=sums.invalid,
+        reliable=not reasons,
+        warnings=(*reasons, *remarks, *notes),
+        draws=sums.draws,
     )
 
 
@@ -403,8 +404,3 @@ def _invalid_warnings(invalid, weight, failing_weight):
         f"{invalid} episodes are invalid (a number that is not finite): if they failed, they"
         f" would add {share}"
     ]
-
-
-def _invalid_remarks(sums):
-    text = "episodes are invalid (a number that is not finite) and count as not failing"
-    return (f"{sums.invalid} of {sums.samples} {text}",) if sums.invalid else ()
