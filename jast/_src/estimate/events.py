@@ -156,8 +156,7 @@ def events(
         raise ValueError(f"{name}: of must be one of {EVENT_ARGUMENTS}, received {of!r}")
     functions = _check_functions(name, named)
     happened = _evaluate_events(name, sim, estimate, draws, functions, of, proposal)
-    log_w = draws.log_weight[draws.failure]
-    return {k: _event(estimate, draws, log_w, v, level) for k, v in happened.items()}
+    return {k: _event(estimate, draws, v, level) for k, v in happened.items()}
 
 
 def given_start(
@@ -196,26 +195,25 @@ def given_start(
     kept, level = draws_and_level(name, estimate, level)
     functions = _check_functions(name, named)
     happened = _evaluate_events(name, sim, estimate, kept, functions, "start", proposal)
-    n, log_w = whole_number(name, "draws", draws), kept.log_weight[kept.failure]
-    count = dict.fromkeys(functions, 0)
+    n, count = whole_number(name, "draws", draws), dict.fromkeys(functions, 0)
     for i in range(-(-n // BLOCK_STARTS)):
         seen = _evaluate_starts(jax.random.fold_in(key, i), sim, functions, BLOCK_STARTS)
         for k, v in seen.items():
             count[k] += int(np.asarray(v)[: n - i * BLOCK_STARTS].sum())
     return {
-        k: _given_start(kept, log_w, v, _event(estimate, kept, log_w, v, level), count[k], n)
+        k: _given_start(kept, v, _event(estimate, kept, v, level), count[k], n)
         for k, v in happened.items()
     }
 
 
-def _given_start(draws, log_w, happened, event, m, n):
+def _given_start(draws, happened, event, m, n):
     """The `GivenStart` of the failing draws in which the ``event`` ``happened``, where ``m`` of
     ``n`` starts are in the set.
     """
     few, level = m < diagnostics.MIN_ESS, event.level
     p, ends = np.nan, (0.0, 1.0)
     if m and event.failing:
-        both = moments_of_weights(log_w[happened], draws.samples)
+        both = moments_of_weights(draws.log_weight[draws.failure][happened], draws.samples)
         # of a ratio of two independent means, to first order
         relative = float(np.hypot(both.relative, np.sqrt((1 - m / n) / m)))
         log_p = float(both.log_mean) - np.log(m / n)
@@ -234,10 +232,11 @@ def _given_start(draws, log_w, happened, event, m, n):
     )
 
 
-def _event(estimate, draws, log_w, happened, level):
+def _event(estimate, draws, happened, level):
     """The `Event` of the failing draws in which it ``happened`` [m]."""
-    w, total = scaled_weights(log_w, draws.counted)
-    chosen, log_w = w[happened], log_w[happened]
+    of_failures = draws.log_weight[draws.failure]
+    w, total = scaled_weights(of_failures, draws.counted)
+    chosen, log_w = w[happened], of_failures[happened]
     k, n = len(chosen), draws.samples
     given, given_ends = share_interval(total, chosen.sum(), (chosen**2).sum(), k, level)
     reasons = [] if estimate.reliable else ["the estimate is UNRELIABLE"]
@@ -249,8 +248,7 @@ def _event(estimate, draws, log_w, happened, level):
             reasons += diagnostics.warnings_of_weights(log_w, n, ess)
     else:  # above by what is not excluded among the failures
         p = ess = 0.0
-        all_failing = moments_of_weights(draws.log_weight[draws.failure], n)
-        ends = 0.0, given_ends[1] * float(np.exp(all_failing.log_mean))
+        ends = 0.0, given_ends[1] * float(np.exp(moments_of_weights(of_failures, n).log_mean))
         reasons.append("the event happened in no failure")
     return Event(
         probability=p,
