@@ -98,14 +98,6 @@ class FailureProposal(NamedTuple):
         return f"{'iteration':>9} {'level':>11} {'failures':>9} {'ess':>10}\n{rows}{note}"
 
 
-class Settings(NamedTuple):
-    """The traced part."""
-
-    quantile: Array
-    smoothing: Array
-    floor: Array
-
-
 def failure_proposal(
     key: PRNGKey,
     sim: Simulator,
@@ -156,25 +148,20 @@ def failure_proposal(
         >>> bool(found.reached)
         True
     """
-    check_random_key("failure_proposal", key)
-    samples = whole_number("failure_proposal", "samples", samples, 2)
-    iterations = whole_number("failure_proposal", "iterations", iterations)
-    settings = Settings(
-        real_number(
-            "failure_proposal", "quantile", quantile, lambda v: 0 < v < 1, "above 0 and below 1"
-        ),
-        real_number(
-            "failure_proposal", "smoothing", smoothing, lambda v: 0 <= v < 1, "from 0 to below 1"
-        ),
-        real_number("failure_proposal", "floor", floor, lambda v: 0 < v < np.inf, "above 0"),
-    )
-    contract("failure_proposal", sim)
-    require_episodes("failure_proposal", sim, samples)
-    return _search(key, sim, settings, _tilts_start(sim), samples, iterations)
+    name = "failure_proposal"
+    check_random_key(name, key)
+    samples = whole_number(name, "samples", samples, 2)
+    iterations = whole_number(name, "iterations", iterations)
+    quantile = real_number(name, "quantile", quantile, lambda v: 0 < v < 1, "above 0 and below 1")
+    smoothing = real_number(name, "smoothing", smoothing, lambda v: 0 <= v < 1, "from 0 to below 1")
+    floor = real_number(name, "floor", floor, lambda v: 0 < v < np.inf, "above 0")
+    contract(name, sim)
+    require_episodes(name, sim, samples)
+    return _search(key, sim, quantile, (smoothing, floor), _tilts_start(sim), samples, iterations)
 
 
-@partial(jit, static_argnums=(3, 4, 5))
-def _search(key, sim, settings, tilt_start, samples, iterations):
+@partial(jit, static_argnums=(4, 5, 6))
+def _search(key, sim, quantile, kept, tilt_start, samples, iterations):
     like = signature_of(sim)
     first = (
         sequences.standard_normal(like.x0, 1) if tilt_start else (),
@@ -186,10 +173,9 @@ def _search(key, sim, settings, tilt_start, samples, iterations):
         keys = jax.random.split(key, samples)
         z0, z, e, log_w = jax.vmap(lambda k: _play(k, sim, proposal))(keys)
         valid = jnp.isfinite(e.distance)
-        level, fails, counts = _elites(e, jnp.where(valid, log_w, -jnp.inf), settings.quantile)
+        level, fails, counts = _elites(e, jnp.where(valid, log_w, -jnp.inf), quantile)
         ess = jnp.sum(counts)
         reached = jnp.arange(sim.horizon, dtype=jnp.int32)[None, :] < e.length[:, None]
-        kept = settings.smoothing, settings.floor
         if tilt_start:
             start = sequences.fit(start, z0, counts[:, None], *kept)
         steps = sequences.fit(steps, z, jnp.where(reached, counts[:, None], 0), *kept)
