@@ -106,16 +106,13 @@ def _by_direction(q):
     """Groups of the components whose means point the same way: failure modes, as lists of
     numbers.
     """
-    ways = transform.unit(np.asarray(q.means, np.float64))
-    left, groups = list(np.flatnonzero(np.isfinite(np.asarray(q.log_weights)))), []
-    while left:
-        group, grown = {left[0]}, True
-        while grown:
-            near = {j for j in left if max(float(ways[i] @ ways[j]) for i in group) > APART}
-            grown, group = not near <= group, group | near
-        groups.append(sorted(group))
-        left = [i for i in left if i not in group]
-    return groups
+    used = np.flatnonzero(np.isfinite(np.asarray(q.log_weights)))
+    ways = transform.unit(np.asarray(q.means, np.float64)[used])
+    near = (ways @ ways.T > APART) | np.eye(len(used), dtype=bool)
+    label, last = np.arange(len(used)), None
+    while not np.array_equal(label, last):  # each takes the least label of those near to it
+        label, last = np.where(near, label, len(used)).min(axis=1), label
+    return [used[label == i].tolist() for i in np.unique(label)]
 
 
 def _traces(shared, i, context):
