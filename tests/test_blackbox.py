@@ -18,7 +18,7 @@ import jast
 from jast import blackbox
 from jast._src.blackbox import answers, worker
 from jast._src.core.rewards import STANDARD
-from jast._src.estimate.tilts.replay import numbers_of_episodes
+from jast._src.estimate.tilts.exploration import numbers_of_episodes
 from jast._src.runtime.host_errors import GROUPS, Log, new_incidents, sources
 from jast.distributions import Categorical, Independent, Joint, MultivariateNormalDiag, Normal
 from jast.incidents import incidents

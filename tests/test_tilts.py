@@ -22,10 +22,9 @@ from jast._src.estimate.proposal_search import by_proposal
 from jast._src.estimate.proposal_search.adapt import adapt_proposal
 from jast._src.estimate.proposal_search.search_state import SearchState, search_context
 from jast._src.estimate.proposal_search.settings import SETTINGS
-from jast._src.estimate.tilts.exploration import descend_levels
+from jast._src.estimate.tilts.exploration import descend_levels, numbers_of_episodes
 from jast._src.estimate.tilts.family import Mixture, TiltFamily
 from jast._src.estimate.tilts.fit import as_tilts, fit_tilt, frame_of, log_ratios, steps_of
-from jast._src.estimate.tilts.replay import numbers_of_episodes
 from jast._src.estimate.tilts.tilts import (
     assemble,
     log_weight,

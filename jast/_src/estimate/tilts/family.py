@@ -35,7 +35,6 @@ from jast._src.estimate.tilts.tilts import (
     Shape,
     Tilts,
     Trace,
-    features,
     shape,
     simulate_points,
     simulate_tilts,
@@ -113,9 +112,7 @@ class TiltFamily(NamedTuple):
     @property
     def model(self) -> Tilt:
         """The model as a tilt."""
-        seen = np.zeros((1, self.about.seen))
-        count = features(unseen_frame(self.about), seen, 0.0, np).shape[1]
-        return model_tilt(self.about, count, self.components_each)
+        return model_tilt(self.about, self.components_each)
 
     def untilted(self) -> Mixture:
         """The model alone."""

@@ -354,8 +354,9 @@ def _log_ratio(block, rows, floor):
     return out
 
 
-def model_tilt(about: Shape, count: int, components_each: int) -> Tilt:
-    """The model as a `Tilt` of ``count`` features, and of so many Gaussians for each number."""
+def model_tilt(about: Shape, components_each: int) -> Tilt:
+    """The model as a `Tilt` of so many Gaussians for each number."""
+    count = features(unseen_frame(about), np.zeros((1, about.seen)), 0.0, np).shape[1]
 
     def block(f, numbers):
         normals, choices, categories, owners = numbers
