@@ -121,11 +121,8 @@ def sample_of_draws(sim: Any, draws: Draws, most: int) -> Sample:
 
 
 def _redraw_tilts(key, sim, q, n):
-    about, dtype = tilts.shape(sim), transform.normal_numbers(sim)
-    chance = tilts.random_numbers(key, n, about, sim.horizon, dtype)
-    o, ratio, trace = tilts.simulate_tilts(sim, q, *chance)
-    z = transform.normal_of(sim, _episodes_of_traces(sim, trace))
-    return z, o, tilts.log_weight(q, ratio)[0]
+    o, log_w, _, trace = tilts.draw_tilts(sim, q, key, n, n)
+    return transform.normal_of(sim, _episodes_of_traces(sim, trace)), o, log_w
 
 
 def _choose_failures(key, sim, sample, n):

@@ -18,8 +18,7 @@ from jast._src.estimate.proposal_search.mixture_draws import (
     draw_mixture,
     numbers_of_chunk,
 )
-from jast._src.estimate.tilts import tilts
-from jast._src.estimate.tilts.tilts import Tilts
+from jast._src.estimate.tilts.tilts import Tilts, draw_tilts
 from jast._src.estimate.weighted_draws import with_source
 from jast._src.normal_space import transform
 from jast._src.runtime.progress_bar import Watch
@@ -120,7 +119,7 @@ def _traces(shared, i, context):
     key, sim, q, members, lanes, samples = shared
     n = min(lanes, samples - i * lanes)
     if isinstance(q, Tilts):
-        o, log_w, shares = _draw_tilts(key, sim, q, i, n, lanes)
+        o, log_w, shares, _ = draw_tilts(sim, q, numpy_generator(key, TILTS, i), lanes, n)
     else:
         _, o, log_w, shares = draw_mixture(sim, q, *numbers_of_chunk(key, i, n, q))
     with np.errstate(divide="ignore"):
@@ -133,14 +132,3 @@ def _traces(shared, i, context):
         length=o.length,
         distance=o.distance,
     )
-
-
-def _draw_tilts(key, sim, q, i, n, lanes):
-    """(`Outcomes`, log p - log q, log shares [n, K]) of the first ``n`` draws of chunk ``i``."""
-    about, dtype = tilts.shape(sim), transform.normal_numbers(sim)
-    u, first, noise = tilts.random_numbers(
-        numpy_generator(key, TILTS, i), lanes, about, sim.horizon, dtype
-    )
-    some = u[:n], tuple(a[:n] for a in first), tuple(a[:, :n] for a in noise)
-    o, ratio, _ = tilts.simulate_tilts(sim, q, *some)
-    return o, *tilts.log_weight(q, ratio)

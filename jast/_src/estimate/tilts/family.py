@@ -185,7 +185,6 @@ class TiltFamily(NamedTuple):
         points = _join(*(b.points for b in state.batches))
         log_w = state.log_weight - np.logaddexp.reduce(state.log_weight)
         of = self.groups(state.q, points)
-        of = np.ones((len(log_w), 1)) if of is None else of
         for more, share in found:
             n = len(more.length)
             own = np.repeat([[0.0], [1.0]], [len(log_w), n], axis=0)
@@ -194,12 +193,12 @@ class TiltFamily(NamedTuple):
             points = _join(points, more)
         return state._replace(q=self.fit(points, log_w, of)) if found else state
 
-    def groups(self, q: Mixture, points: Points) -> np.ndarray | None:
-        """Which part [m, M] of each of the ``points`` belongs to each group of the tilts of ``q``;
-        None where there is one.
+    def groups(self, q: Mixture, points: Points) -> np.ndarray:
+        """Which part [m, M] of each of the ``points`` belongs to each group of the tilts of ``q``:
+        all where there is one.
         """
         if len(q.tilts) <= 3:
-            return None
+            return np.ones((len(points.length), 1))
         joint = self._joint(q, points)[:, 1:]
         r = np.exp(joint - joint.max(axis=1, keepdims=True))
         r = r.reshape(len(r), -1, 2).sum(axis=2)

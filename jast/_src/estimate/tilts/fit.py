@@ -22,7 +22,6 @@ from jast._src.estimate.tilts.tilts import (
     Shape,
     Tilts,
     Trace,
-    choice_features,
     count_rare_before,
     features,
 )
@@ -201,8 +200,10 @@ def _ridge(size):
 
 
 def _choice_features(rows, j):
-    y = rows.x[:, FIRST_STATE_FEATURE if rows.x.shape[1] > FIRST_STATE_FEATURE else 0]
-    return choice_features(rows.x, y, rows.rare[:, j], np)
+    """Features [N, F + 3] of choice ``j``, as `Block` has them."""
+    y = rows.x[:, FIRST_STATE_FEATURE if rows.x.shape[1] > FIRST_STATE_FEATURE else 0, None]
+    r = rows.rare[:, j, None]
+    return np.concatenate([rows.x, r, r * r, r * y], axis=-1)
 
 
 def _common(rows, w, mine, size):

@@ -39,13 +39,11 @@ __all__ = [
     "Tilts",
     "Trace",
     "assemble",
-    "choice_features",
     "count_rare_before",
     "dimension",
+    "draw_tilts",
     "features",
     "interval_starts",
-    "log_weight",
-    "random_numbers",
     "shape",
     "simulate_points",
     "simulate_tilts",
@@ -92,8 +90,9 @@ class Block(NamedTuple):
     gates: ArrayLike
     """[K, F, C', A, G] and the log weights of these Gaussians"""
     shifts: ArrayLike
-    """[K, F + 3, B, C] by which `choice_features` give what is added to the log probabilities of
-    choices"""
+    """[K, F + 3, B, C] by which the features of a choice, those of its step and three of how many
+    choices before it came out rare, give what is added to its log probabilities: so the choices of
+    one step depend on each other, and three parts may fail at once"""
     scales: ArrayLike
     """[K, C', A, G] the logs of their deviations; where G is 1, of no effect"""
 
@@ -238,16 +237,6 @@ def tilt_log_probabilities(log_p: jax.Array, shifts: jax.Array, floors: jax.Arra
     log_p = log_p[None]
     lifted = jnp.where(log_p > -jnp.inf, jnp.maximum(log_p, floors[:, None, None]), -jnp.inf)
     return jax.nn.log_softmax(lifted + shifts, axis=-1)
-
-
-def choice_features(x: Array, y: Array, rare: Array, np: ModuleType = jnp) -> Array:
-    """Features [..., F + 3] of a choice: those of its step ``x`` [..., F], and how many of the
-    choices before it came out ``rare`` [...]; ``y``: the second feature of ``x`` that is no time.
-
-    So the choices of one step depend on each other: three parts may fail at once.
-    """
-    r = rare[..., None]
-    return np.concatenate([x, r, r * r, r * y[..., None]], axis=-1)
 
 
 def count_rare_before(log_p: Array, i: Array, np: ModuleType = jnp) -> Array:
@@ -421,6 +410,16 @@ def _simulate(sim, q, u, first, noise):
         ratio,
         Trace(*first_rows, *(jnp.swapaxes(a, 0, 1) for a in rows)),
     )
+
+
+def draw_tilts(sim, q, key, size, n):
+    """The first ``n`` of ``size`` episodes of ``q``: (`Outcomes`, log p - log q [n], log shares of
+    the components [n, K], `Trace`), on the host; ``key`` as in `random_numbers`.
+    """
+    u, first, noise = random_numbers(key, size, shape(sim), sim.horizon, normal_numbers(sim))
+    some = u[:n], tuple(a[:n] for a in first), tuple(a[:, :n] for a in noise)
+    o, ratio, trace = simulate_tilts(sim, q, *some)
+    return o, *log_weight(q, ratio), trace
 
 
 def random_numbers(key, n, about, horizon, dtype):
