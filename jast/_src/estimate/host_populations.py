@@ -128,17 +128,13 @@ class PopulationSampler:
 
     def simulate(self, z):
         """The population of the points ``z`` [size, D]."""
-        if self.covered is None:
-            o = evaluate_points(self.sim, z)
-            score = o.score
+        q, threshold = self.covered or (None, math.inf)
+        if isinstance(q, Tilts):
+            o, log_q, _ = simulate_points(self.sim, q, z)
         else:
-            q, threshold = self.covered
-            if isinstance(q, Tilts):
-                o, log_q, _ = simulate_points(self.sim, q, z)
-            else:
-                o = evaluate_points(self.sim, z)
-                log_q = log_ratio(q, z, o.used)
-            score = np.where(log_q > float(threshold), np.inf, o.score)
+            o = evaluate_points(self.sim, z)
+            log_q = -math.inf if q is None else log_ratio(q, z, o.used)
+        score = np.where(log_q > float(threshold), np.inf, o.score)
         self.evaluations += self.size
         self.invalid += int(o.invalid.sum())
         return Population(z, score, o.used, o.invalid)
