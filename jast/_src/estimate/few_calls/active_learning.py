@@ -74,14 +74,11 @@ class Learner:
         before = len(self.z)
         for i in range(0, len(z), self.batch):
             rows = np.asarray(z[i : i + self.batch], self.dtype)
-            o = answer_once(self._simulate, rows)
+            o = answer_once(lambda z: transform.outcomes(self.sim, jnp.asarray(z)), rows)
             self.spent, self.steps = self.spent + len(rows), self.steps + int(o.length.sum())
             self.record(rows, o.distance, o.failure, o.invalid)
             self.watch.more(len(rows))
         return self.failing[before:], self.invalid[before:]
-
-    def _simulate(self, rows):
-        return transform.outcomes(self.sim, jnp.asarray(rows))
 
     def record(self, z, distance, failing, invalid):
         """Keep what was seen at ``z``."""
