@@ -22,8 +22,8 @@ from jast._src.estimate.estimate import Estimate, estimate_from_counts, estimate
 from jast._src.estimate.gaussians.exploration import draw_model, explore_failures
 from jast._src.estimate.gaussians.family import GaussianFamily
 from jast._src.estimate.gaussians.moments import explore_moments
-from jast._src.estimate.importance_sampling import Traces, chunks
-from jast._src.estimate.monte_carlo import simulate_points
+from jast._src.estimate.importance_sampling import chunks
+from jast._src.estimate.monte_carlo import plain_traces, simulate_points
 from jast._src.estimate.proposal_search.adapt import adapt_proposal
 from jast._src.estimate.proposal_search.audit import audit_proposal
 from jast._src.estimate.proposal_search.final_draws import draw_estimate
@@ -329,17 +329,11 @@ def _draw_proposal(request, search, watch, reasons):
 
 def _estimate_by_batches(request, search, reasons):
     """The `Estimate` of the batches of a search that was interrupted, by the balance heuristic."""
-    state, none = search.state, np.zeros(len(search.state.log_weight))
-    failures = Traces(
-        log_weight=state.log_weight,
-        shares=none[:, None],
-        failure=none == 0,
-        invalid=none != 0,
-        length=none.astype(int),
-    )
-    total = weight_sums.add_traces(weight_sums.empty_sums(state.size), failures)._replace(
-        samples=state.size
-    )
+    state, n = search.state, len(search.state.log_weight)
+    failures = plain_traces(np.ones(n, bool), np.zeros(n, bool), np.zeros(n, int))
+    failures = failures._replace(log_weight=state.log_weight)
+    total = weight_sums.add_traces(weight_sums.empty_sums(state.size), failures)
+    total = total._replace(samples=state.size)
     said = (
         f"interrupted after {state.spent} of {request.budget} evaluations: the estimate uses the"
         " same episodes that chose the proposal"
