@@ -10,7 +10,7 @@ import numpy as np
 
 from jast._src.util.intervals import log_normal, student_factor
 
-__all__ = ["LOST_MODE_REMARK", "MIN_REPLICATES", "Replicates", "mean_of_replicates"]
+__all__ = ["LOST_MODE_REMARK", "MIN_REPLICATES", "mean_of_replicates"]
 
 LOST_MODE_REMARK = (
     "a failure mode that few members of a population reach can be lost without a sign"

@@ -101,7 +101,7 @@ def add_traces(total: Sums, traces: Any, plain: np.ndarray | None = None) -> Sum
         failures=total.failures + int(failure.sum()),
         invalid=total.invalid + int(invalid.sum()),
         invalid_first=total.invalid_first * rescale
-        + (np.exp(bad - top).sum() if bad.size and top > -np.inf else 0.0),
+        + (np.exp(bad - top).sum() if top > -np.inf else 0.0),
         undefined=total.undefined + int(failure.sum()) - len(log_w),
         top=top,
         first=total.first * rescale + w.sum(),

@@ -26,7 +26,6 @@ from jast._src.normal_space.moments import Linearised
 from jast._src.normal_space.transform import Latent
 
 __all__ = [
-    "Layers",
     "Planes",
     "first_layers",
     "fit_layers",

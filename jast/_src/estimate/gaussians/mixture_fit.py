@@ -22,7 +22,6 @@ __all__ = [
     "mix",
     "most_components",
     "nearest_centre",
-    "shrink_eigenvalues",
     "shrink_to_anchors",
     "tempering_power",
     "unit_gaussians",

@@ -198,10 +198,9 @@ def _explore_uncovered(family, state):
     """
     if not (size := _population_size(family, state)):
         return state.with_reason(UNFINISHED), []
-    key = family.context.next_key()
     outside = family.exclusion(state.q, _coverage_threshold(family, state))
     p = explore(
-        key,
+        family.context.next_key(),
         family.sim,
         size,
         covered=outside,

@@ -9,7 +9,7 @@ import numpy as np
 
 from jast._src.core.counter_prng import numpy_generator
 
-__all__ = ["FRESH", "KILLED", "Paths", "Played", "Run", "climb"]
+__all__ = ["FRESH", "Played", "Run", "climb"]
 
 FRESH = -1
 """The parent of a new episode."""
