@@ -185,28 +185,27 @@ def importance(
         >>> bool(found.failing > 100)
         True
     """
-    check_random_key("importance", key)
-    samples = whole_number("importance", "samples", samples, 2)
-    to_horizon = _goes_to_horizon("importance", mode)
-    level = checked_level("importance", level)
-    contract("importance", sim)
-    proposal = as_proposal("importance", sim, proposal)
-    settings = call_settings("importance", key, samples=samples, mode=mode, level=level)
+    name = "importance"
+    check_random_key(name, key)
+    samples = whole_number(name, "samples", samples, 2)
+    to_horizon = _goes_to_horizon(name, mode)
+    level = checked_level(name, level)
+    contract(name, sim)
+    proposal = as_proposal(name, sim, proposal)
+    settings = call_settings(name, key, samples=samples, mode=mode, level=level)
     whole_key = key
     key, for_probes = jax.random.split(key)
-    placement = work.placement("importance", executor, devices)
+    placement = work.placement(name, executor, devices)
     about = dict(sim=sim, proposal=proposal, samples=samples, mode=mode)
     reasons = [] if proposal.covers else _uncovered(for_probes, sim, proposal)
     lanes = chunk_size(samples)
-    with open_checkpoint("importance", checkpoint, whole_key, **about) as store:
+    with open_checkpoint(name, checkpoint, whole_key, **about) as store:
         shared = key, sim, proposal, lanes, to_horizon
-        watch = Watch("importance", samples, "episode", progress, callback)
-        total, notes, lost = chunks(
-            of_policies, shared, lanes, watch, placement._replace(store=store)
-        )
-    found = estimate_from_weights(
-        "importance", total, level=level, reasons=[*reasons, *lost], notes=notes
-    )
+        watch = Watch(name, samples, "episode", progress, callback)
+        placement = placement._replace(store=store)
+        total, notes, lost = chunks(of_policies, shared, lanes, watch, placement)
+    reasons += lost
+    found = estimate_from_weights(name, total, level=level, reasons=reasons, notes=notes)
     draws = with_source(found.draws, key, lanes, "policy")
     return found._replace(settings=settings, draws=draws)
 

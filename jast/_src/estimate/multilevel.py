@@ -203,10 +203,8 @@ def proposing(sim: Simulator, start: Any, steps: Any) -> Policy:
     """The `Policy` of a simulator's disturbances, tilted by `Steps` of x0 (``()``: not tilted) and
     of x.
     """
-    return Policy(
-        Partial(_start, sim.start, start) if start != () else sim.start,
-        Partial(_disturbance, sim.disturbance, steps),
-    )
+    begin = Partial(_start, sim.start, start) if start != () else sim.start
+    return Policy(begin, Partial(_disturbance, sim.disturbance, steps))
 
 
 def _play(key, sim, proposal):

@@ -124,10 +124,8 @@ def trace_proposal(
     share = epsilon if mixing == "step" else None
 
     def component(start, steps):
-        return Policy(
-            Partial(_trace_start, sim.start, start, share) if tilt_start else sim.start,
-            Partial(_trace_step, sim.disturbance, steps, share),
-        )
+        begin = Partial(_trace_start, sim.start, start, share) if tilt_start else sim.start
+        return Policy(begin, Partial(_trace_step, sim.disturbance, steps, share))
 
     return Proposal(log_weights, jax.vmap(component)(start, steps), True)
 
@@ -185,12 +183,9 @@ def policy_proposal(
         log_weights = jnp.log(jnp.stack([1 - epsilon, epsilon]))
 
     def component(strength):
-        return Policy(
-            Partial(_policy_start, sim.start, policy.start, strength, share)
-            if tilt_start
-            else sim.start,
-            Partial(_policy_step, sim.disturbance, policy.disturbance, strength, share),
-        )
+        begin = Partial(_policy_start, sim.start, policy.start, strength, share)
+        step = Partial(_policy_step, sim.disturbance, policy.disturbance, strength, share)
+        return Policy(begin if tilt_start else sim.start, step)
 
     try:
         ask(sim, lambda start, state, dist: component(strength[0]).disturbance(state, jnp.int32(0)))
@@ -204,10 +199,8 @@ def as_proposal(function, sim, proposal):
     for anything else, and for a policy without a density.
     """
     if isinstance(proposal, Policy):
-        dtype = jnp.zeros(()).dtype
-        proposal = Proposal(
-            jnp.zeros((1,), dtype), jax.tree.map(lambda a: jnp.asarray(a)[None], proposal)
-        )
+        stacked = jax.tree.map(lambda a: jnp.asarray(a)[None], proposal)
+        proposal = Proposal(jnp.zeros(1), stacked)
     if not isinstance(proposal, Proposal):
         raise ValueError(
             f"{function}: proposal must be a Proposal or a jast.Policy, received"
