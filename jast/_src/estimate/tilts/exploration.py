@@ -193,9 +193,8 @@ def _numbers(sim, x0, disturbances, length):
         e = play_back(sim, log_likelihood, x0, x, length)
         states = jax.tree.map(lambda a: a[:-1], e.states)
         first = _numbers_of_value(parts(sim.start()), e.x0)
-        z = jax.vmap(lambda s, x: _numbers_of_value(parts(sim.disturbance(s)), x))(
-            states, e.disturbances
-        )
+        of_steps = jax.vmap(lambda s, x: _numbers_of_value(parts(sim.disturbance(s)), x))
+        z = of_steps(states, e.disturbances)
         live = jnp.arange(sim.horizon, dtype=jnp.int32) < e.length
         z = jnp.concatenate([first, jnp.where(live[:, None], z, 0).ravel()])
         return jnp.nan_to_num(z, posinf=FAR, neginf=-FAR)

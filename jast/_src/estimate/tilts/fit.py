@@ -265,13 +265,11 @@ def _shares(x, z, means, log_g, scales):
 
 def _least_squares(x, z, w, ridge):
     """Least squares [F, G] of ``z`` [N, G] by ``x`` with the weights ``w`` [N, G]."""
-    return np.stack(
-        [
-            np.linalg.solve(x.T @ (x * v[:, None]) + np.diag(ridge), x.T @ (y * v))
-            for y, v in zip(z.T, w.T, strict=True)
-        ],
-        axis=1,
-    )
+    columns = [
+        np.linalg.solve(x.T @ (x * v[:, None]) + np.diag(ridge), x.T @ (y * v))
+        for y, v in zip(z.T, w.T, strict=True)
+    ]
+    return np.stack(columns, axis=1)
 
 
 def _fit_log_odds(x, target, log_p, w, ridge, start=None):
@@ -325,16 +323,12 @@ def log_ratios(tilts: list[Tilt], rows: tuple[Rows, Rows], n: int) -> np.ndarray
     of its `Rows`, summed in double.
     """
     tilts = jax.tree.map(lambda a: np.asarray(a, rows[1].x.dtype), tilts)
-    return np.stack(
-        [
-            sum(
-                np.bincount(r.trace, _log_ratio(b, r, tilt.floor), minlength=n)
-                for r, b in zip(rows, tilt[:2], strict=True)
-            )
-            for tilt in tilts
-        ],
-        axis=1,
-    )
+
+    def of_tilt(tilt):
+        each = zip(rows, tilt[:2], strict=True)
+        return sum(np.bincount(r.trace, _log_ratio(b, r, tilt.floor), minlength=n) for r, b in each)
+
+    return np.stack([of_tilt(tilt) for tilt in tilts], axis=1)
 
 
 def _log_ratio(block, rows, floor):

@@ -398,18 +398,13 @@ def _simulate(sim, q, u, first, noise):
         rows = tuple(a.at[t].set(b) for a, b in zip(rows, row, strict=True))
         return progress, ratio, length, t + 1, rows
 
-    zero = jnp.zeros((), jnp.int32)
+    first_carry = progress, ratio, jnp.zeros(n, jnp.int32), jnp.zeros((), jnp.int32), rows
     progress, ratio, length, _, rows = lax.while_loop(
-        lambda c: jnp.any(~c[0].done) & (c[3] < horizon),
-        body,
-        (progress, ratio, jnp.zeros(n, jnp.int32), zero, rows),
+        lambda c: jnp.any(~c[0].done) & (c[3] < horizon), body, first_carry
     )
     end = jax.vmap(lambda p: conclude(sim, density, p))(progress)
-    return (
-        outcomes_of(sim, end, length),
-        ratio,
-        Trace(*first_rows, *(jnp.swapaxes(a, 0, 1) for a in rows)),
-    )
+    trace = Trace(*first_rows, *(jnp.swapaxes(a, 0, 1) for a in rows))
+    return outcomes_of(sim, end, length), ratio, trace
 
 
 def draw_tilts(sim, q, key, size, n):
