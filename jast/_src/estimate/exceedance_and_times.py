@@ -300,9 +300,8 @@ class _DistanceDistribution:
         order = np.argsort(draws.severity, kind="stable")
         self.draws, self.severity = draws, draws.severity[order]
         self.log_w = draws.log_weight[order].astype(np.float64)
-        self.moments = moments_of_sums(
-            [np.logaddexp.accumulate(i * self.log_w) for i in (1, 2, 3)], draws.samples
-        )
+        log_sums = [np.logaddexp.accumulate(i * self.log_w) for i in (1, 2, 3)]
+        self.moments = moments_of_sums(log_sums, draws.samples)
 
     def probability(self, i):
         return math.exp(min(self.moments.log_mean[i], 0.0))  # weights may have a mean above 1

@@ -7,6 +7,7 @@ failure at these. A quarter of each batch looks where nobody has looked.
 """
 
 import math
+from itertools import count
 from typing import Any
 
 import jax.numpy as jnp
@@ -117,8 +118,7 @@ def choose_calls(learner: Learner) -> None:
     width = np.where(of_model, 1.0, FIRST_WIDTH)[:, None]
     failing, invalid = learner.call(width * learner.rng.standard_normal((first, learner.dimension)))
     learner.plain = int(failing[of_model].sum()), int(invalid[of_model].sum()), int(of_model.sum())
-    i = 0
-    while True:
+    for i in count():
         learner.fit(i % WARP_EVERY == 0)
         if learner.spent >= calls:
             break
@@ -126,7 +126,6 @@ def choose_calls(learner: Learner) -> None:
         unseen = int(UNSEEN_SHARE * batch) if learner.failing.any() else 0
         chosen = _least_doubt(learner, batch - unseen)
         learner.call(np.concatenate([_unseen(learner, unseen), chosen]))
-        i += 1
     learner.history.append(
         f"learning: {learner.spent} calls, {int(learner.failing.sum())} failures,"
         f" {int(learner.invalid.sum())} invalid"

@@ -114,13 +114,12 @@ def _equilibrate_cooled(family, state):
     """The failures that wide noise led to as the model has them, after Markov moves; None where
     there are none.
     """
-    settings = family.settings
-    most = int(settings.burn_in_share * family.budget)
-    z = None if state.cooled is None else state.cooled[: max(most // settings.burn_in_moves, 1)]
+    moves = family.settings.burn_in_moves
+    most = int(family.settings.burn_in_share * family.budget)
+    z = None if state.cooled is None else state.cooled[: max(most // moves, 1)]
     if z is None or not len(z):
         return state, None
     key, everywhere = family.context.next_key(), family.exclusion(state.q, math.inf)
-    moves = settings.burn_in_moves
     population, sampler = equilibrate(
         key, family.sim, z, moves, covered=everywhere, max_evaluations=most
     )
