@@ -97,14 +97,8 @@ def subset_simulation(
     ):
         shared = jax.random.split(key, replicates), sim, samples
         task = Task(_run_replicate, shared, lambda: Explored(*Explored._fields))
-        ran = work.run(
-            task,
-            replicates,
-            lambda runs, number, run: (*runs, run),
-            (),
-            watch,
-            placement._replace(store=store),
-        )
+        placement = placement._replace(store=store)
+        ran = work.run(task, replicates, lambda all, i, run: (*all, run), (), watch, placement)
     runs = ran.state
     short = work.describe_missing("populations", ran, len(runs), replicates)
     if len(runs) < MIN_REPLICATES:

@@ -128,10 +128,8 @@ class ObjectPaths:
 
     def draw(self, lanes):
         """The next disturbance of each lane, as leaves [LANES, ...]."""
-        rows = self._stacked(lanes)
-        return jax.tree.leaves(
-            jax.device_get(_draw_next(self.sim, self.key, np.int32(self.times), rows))
-        )
+        xs = _draw_next(self.sim, self.key, np.int32(self.times), self._stacked(lanes))
+        return jax.tree.leaves(jax.device_get(xs))
 
     def move(self, lane, x):
         """The lane goes on by this disturbance, leaves; returns what its object then says."""
