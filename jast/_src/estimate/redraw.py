@@ -59,11 +59,8 @@ def is_proposal_of(sim: Any, q: Any) -> bool:
     def sizes(block):
         return block.means.shape[3], *block.shifts.shape[2:]
 
-    return (
-        q.frame.centre.shape[0] == about.seen
-        and sizes(q.steps) == about.steps[:3]
-        and sizes(q.first) == about.first[:3]
-    )
+    received = sizes(q.first), sizes(q.steps), q.frame.centre.shape[0]
+    return received == (about.first[:3], about.steps[:3], about.seen)
 
 
 def dimension_of(q: Any) -> int | None:
