@@ -2,7 +2,6 @@
 the mode of the disturbance.
 """
 
-import math
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -11,6 +10,8 @@ import jax.numpy as jnp
 
 from jast import distributions as D
 from jast._src.core.counter_prng import coin
+from jast._src.distributions.flat_rows import unflat
+from jast._src.util.pytrees import count_numbers, select
 
 __all__ = ["Choice"]
 
@@ -47,43 +48,37 @@ class Choice:
         ``start``: it is an x0.
         """
         kinds = 2 if self._can_focus(dist) else 1
-        place = (
-            None
-            if start and not self.actions.places_start
-            else getattr(self.actions, "place", None)
-        )
-        if self.spread and place is not None:
-            x = place(_point(key, slot // kinds, D.event_like(dist)), dist)
+        places = hasattr(self.actions, "place") and (not start or self.actions.places_start)
+        if self.spread and places:
+            x = self.actions.place(_point(key, slot // kinds, D.event_like(dist)), dist)
         else:
-            x = (self.actions.draw_start if start else self.actions.draw)(
-                jax.random.fold_in(key, slot), dist
-            )
+            x = self._drawn(jax.random.fold_in(key, slot), dist, start)
         return self._near(slot % 2 == 1, x, dist, start) if kinds == 2 else x
 
     def roll(self, key, tree_key, dist, start=False):
         """An action of a rollout, by its own key and its tree's."""
-        x = (self.actions.draw_start if start else self.actions.draw)(key, dist)
-        return (
-            self._near(coin(key) & coin(tree_key), x, dist, start) if self._can_focus(dist) else x
-        )
+        x = self._drawn(key, dist, start)
+        if not self._can_focus(dist):
+            return x
+        return self._near(coin(key) & coin(tree_key), x, dist, start)
+
+    def _drawn(self, key, dist, start):
+        return (self.actions.draw_start if start else self.actions.draw)(key, dist)
 
     def _can_focus(self, dist):
-        floats = [
-            jnp.issubdtype(s.dtype, jnp.floating) for s in jax.tree.leaves(D.event_like(dist))
-        ]
+        leaves = jax.tree.leaves(D.event_like(dist))
+        floats = [jnp.issubdtype(s.dtype, jnp.floating) for s in leaves]
         return self.focused and any(floats) and D.has_mode(dist)
 
     def _near(self, pred, x, dist, start):
-        near = self.actions.near(x, dist, self.focus, start)
-        return jax.tree.map(lambda a, b: jnp.where(pred, a, b), near, x)
+        return select(pred, self.actions.near(x, dist, self.focus, start), x)
 
 
 def _point(key, index, event):
     """The point of a node's sequence with this number, in the unit cube of ``event``'s shape: R_d,
     x_n = frac(shift + n / phi_d^j), j = 1 .. d.
     """
-    leaves, treedef = jax.tree.flatten(event)
-    dimension = sum(math.prod(s.shape) for s in leaves)
+    dimension = count_numbers(event)
     phi = 2.0
     for _ in range(60):  # the positive root of phi^(d + 1) = phi + 1
         phi = (1 + phi) ** (1 / (dimension + 1))
@@ -92,14 +87,4 @@ def _point(key, index, event):
         [int(phi ** -(j + 1) * 2**32) & 0xFFFFFFFF for j in range(dimension)], jnp.uint32
     )
     words = jax.random.bits(key, (dimension,), jnp.uint32) + steps * index.astype(jnp.uint32)
-    out, at = [], 0
-    for s in leaves:
-        n = math.prod(s.shape)
-        dtype = D.float_dtype(s.dtype)
-        out.append(
-            ((words[at : at + n] >> 8).astype(dtype) * jnp.asarray(2.0**-24, dtype)).reshape(
-                s.shape
-            )
-        )
-        at += n
-    return treedef.unflatten(out)
+    return jax.tree.map(lambda a: a * jnp.asarray(2.0**-24, a.dtype), unflat(words >> 8, event))

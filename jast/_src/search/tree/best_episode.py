@@ -10,11 +10,13 @@ import jax.numpy as jnp
 from jast._src.core.signature import signature_of
 from jast._src.core.simulator import Simulator
 from jast._src.search.tree.packing import pack, shapes, unpack, width
+from jast._src.util.pytrees import select
 
 __all__ = [
     "Lead",
     "feed_level",
     "fed_of",
+    "fed_source",
     "take_fed",
     "follows",
     "no_lead",
@@ -83,10 +85,16 @@ def fed_of(tree, simulation, lane):
     return fed if isinstance(fed, tuple) else fed[simulation, lane]
 
 
+def fed_source(tree, source, lane):
+    """What the rollouts that actions were taken from, ``source`` of `Node`, were fed; ``()`` where
+    none is taken from any, or nothing ever is.
+    """
+    return fed_of(tree, jnp.maximum(source - 1, 0), lane) if follows(tree) else ()
+
+
 def take_fed(sim, words, here, x):
     """One lane: the disturbance that is fed, where there is one and ``here``; else ``x``."""
-    there = here & (words[0] > 0)
-    return jax.tree.map(lambda a, b: jnp.where(there, a, b), unpack(words[1:], _like(sim)), x)
+    return select(here & (words[0] > 0), unpack(words[1:], _like(sim)), x)
 
 
 def update_lead(tree, walk, fresh, child, value, failed, i, middle):
@@ -98,7 +106,6 @@ def update_lead(tree, walk, fresh, child, value, failed, i, middle):
     # of failures only: following every better miss costs more finds than it brings
     if follows(tree):
         better &= failed
-    if follows(tree):
         moves = fresh & (better | lead.on)
         lane, new = jnp.arange(len(value), dtype=jnp.int32), jnp.zeros_like(lead.node) + i + 1
         lead = lead._replace(

@@ -14,10 +14,9 @@ from jast._src.search.tree.layout import (
     choose_child,
     levels,
     node_keys,
-    node_shapes,
+    nodes_of,
     of_lanes,
 )
-from jast._src.search.tree.packing import unpack
 
 __all__ = ["evaluate_children"]
 
@@ -33,22 +32,14 @@ def evaluate_children(problem, axes, tree, walk, fresh, replay, memoize):
     """
     lanes = tree.key.shape[0]
     lane, nowhere = jnp.arange(lanes, dtype=jnp.int32), tree.edges.size
-    like = node_shapes(tree, memoize)
     if problem.guide.eager:
-        depth = jnp.broadcast_to(
-            jnp.arange(walk.new.shape[0], dtype=jnp.int32)[:, None], walk.new.shape
-        )
-        todo = (
-            (tree.alive & ~tree.ended)[None]
-            & (walk.new > 0)
-            & (depth >= tree.depth[None])
-            & (depth <= walk.depth[None])
-        )
         new, last = walk.new, walk.last
+        depth = lax.broadcasted_iota(jnp.int32, new.shape, 0)
+        on_path = (depth >= tree.depth[None]) & (depth <= walk.depth[None])
+        todo = (tree.alive & ~tree.ended)[None] & (new > 0) & on_path
     else:
-        depth, todo, new, last = (
-            a[None] for a in (walk.depth, fresh, walk.best.slot + 1, walk.best.edge // ROW)
-        )
+        row = walk.depth, fresh, walk.best.slot + 1, walk.best.edge // ROW
+        depth, todo, new, last = (a[None] for a in row)
 
     opens = todo & (new % PAGE == 0)  # a page of its own
     rank = jnp.cumsum(opens, axis=0, dtype=jnp.int32)
@@ -58,11 +49,8 @@ def evaluate_children(problem, axes, tree, walk, fresh, replay, memoize):
     # the new child, and the first one where the new one is its first sibling
     both = jnp.concatenate([todo, todo & (new == 1)])
     per_lane = jnp.sum(both, axis=0, dtype=jnp.int32)
-    place = (
-        jnp.cumsum(both, axis=0, dtype=jnp.int32)
-        - 1
-        + (jnp.cumsum(per_lane, dtype=jnp.int32) - per_lane)[None]
-    )
+    before = jnp.cumsum(per_lane, dtype=jnp.int32) - per_lane  # those of the trees to the left
+    place = jnp.cumsum(both, axis=0, dtype=jnp.int32) - 1 + before[None]
     place = jnp.where(both, place, -1).reshape(-1)
     number, room = jnp.arange(place.size, dtype=jnp.int32), 2 * lanes
     total = jnp.sum(per_lane, dtype=jnp.int32)
@@ -70,18 +58,15 @@ def evaluate_children(problem, axes, tree, walk, fresh, replay, memoize):
     def some(carry):
         done, edges, values, steps = carry
         here = (place >= done) & (place < done + room)
-        entry = (
-            jnp.zeros((room,), jnp.int32)
-            .at[jnp.where(here, place - done, room)]
-            .set(number, mode="drop")
-        )
+        at = jnp.where(here, place - done, room)
+        entry = jnp.zeros((room,), jnp.int32).at[at].set(number, mode="drop")
         live = jnp.arange(room, dtype=jnp.int32) < total - done
         at = entry // lanes % len(new), entry % lanes
         level, column = depth[at], at[1]
         slot = jnp.where(entry >= new.size, 0, new[at])
         node, row = walk.trail[level, column], rows[at]
         if memoize == "node":
-            state = jax.vmap(lambda w: unpack(w, like).state)(tree.nodes[node, column])
+            state = nodes_of(tree, memoize, tree.nodes[node, column]).state
         else:
             state, taken = replay(column, level, live)
             steps = steps.at[jnp.where(live, column, lanes)].add(taken, mode="drop")
@@ -90,16 +75,11 @@ def evaluate_children(problem, axes, tree, walk, fresh, replay, memoize):
         )
         # the level of a random start has no value: all its children score 0
         v = jnp.where(level < levels(problem.sim) - problem.sim.horizon, 0, v).astype(values.dtype)
-        values = values.at[jnp.where(live, row * (PAGE + 1) + slot % PAGE, nowhere)].set(
-            v, mode="drop"
-        )
+        to = jnp.where(live, row * (PAGE + 1) + slot % PAGE, nowhere)
+        values = values.at[to].set(v, mode="drop")
         link = jnp.where(live & opens[at], last[at] * ROW + LINK, nowhere)
-        return (
-            done + room,
-            edges.at[link].add(page[at].astype(edges.dtype), mode="drop"),
-            values,
-            steps,
-        )
+        edges = edges.at[link].add(page[at].astype(edges.dtype), mode="drop")
+        return done + room, edges, values, steps
 
     _, edges, values, steps = lax.while_loop(
         lambda c: c[0] < total, some, (jnp.int32(0), tree.edges, tree.values, tree.steps)

@@ -11,7 +11,7 @@ from jax import lax
 from jast._src.core.signature import signature_of
 from jast._src.distributions.flat_rows import flat
 from jast._src.heads.heads import observation
-from jast._src.search.tree.best_episode import fed_of
+from jast._src.search.tree.best_episode import fed_source
 from jast._src.search.tree.layout import (
     CHILD,
     FAILURE,
@@ -25,9 +25,8 @@ from jast._src.search.tree.layout import (
     choose_child,
     levels,
     node_keys,
-    node_shapes,
+    nodes_of,
 )
-from jast._src.search.tree.packing import unpack
 from jast._src.util import display
 
 __all__ = ["Branches", "Edges", "branches_of", "edges_of"]
@@ -65,9 +64,9 @@ def edges_of(problem, tree, children, axes=None):
 
         def edge(parent, slot):
             state = jax.tree.map(lambda a: a[parent], states)
-            return observation(problem.sim, state), flat(
-                choose_child(problem, node_keys(keys[None], parent[None])[0], slot, state)[1]
-            )
+            node_key = node_keys(keys[None], parent[None])[0]
+            _, x = choose_child(problem, node_key, slot, state)
+            return observation(problem.sim, state), flat(x)
 
         return jax.vmap(edge)(parent, slot)
 
@@ -112,7 +111,7 @@ def branches_of(problem, tree, children, axes=None):
     node, child, visits, q, valid = _numbers(problem, tree, children)
     parent, slot = node.parent[1:], node.slot[1:]
     lane = jnp.arange(tree.key.shape[0], dtype=jnp.int32)
-    level, source, fed = jnp.zeros_like(parent), (), ()
+    level, source = jnp.zeros_like(parent), node.source
     if problem.choice.follow:
 
         def up(_, at):
@@ -120,8 +119,8 @@ def branches_of(problem, tree, children, axes=None):
             return jnp.take_along_axis(node.parent, above, axis=0), level + jnp.sign(above)
 
         _, level = lax.fori_loop(0, levels(problem.sim), up, (parent, level))
-        source = node.source[1:]
-        fed = fed_of(tree, jnp.maximum(source - 1, 0), lane[None])
+        source = source[1:]
+    fed = fed_source(tree, source, lane[None])
 
     def one(problem, key, states, *of):
         """A tree's, [S, ...]."""
@@ -136,15 +135,15 @@ def branches_of(problem, tree, children, axes=None):
         problem, tree.key, node.state, parent, slot, level, source, fed
     )
     return Branches(
-        parent,
-        start,
-        x,
-        jnp.where(valid, visits, 0).astype(jnp.int32),
-        q,
-        valid & (child < 0),
-        node.distance[1:],
-        tree.log,
-        (tree.outcome & FAILURE) > 0,
+        parent=parent,
+        start=start,
+        x=x,
+        visits=jnp.where(valid, visits, 0).astype(jnp.int32),
+        q=q,
+        end=valid & (child < 0),
+        distance=node.distance[1:],
+        reward=tree.log,
+        failure=(tree.outcome & FAILURE) > 0,
     )
 
 
@@ -154,14 +153,12 @@ def _numbers(problem, tree, children):
     """
     lanes = tree.key.shape[0]
     lane = jnp.arange(lanes, dtype=jnp.int32)[None]
-    like = node_shapes(tree, "node")
-    node = jax.vmap(jax.vmap(lambda w: unpack(w, like)))(tree.nodes)
+    node = nodes_of(tree, "node", tree.nodes)
     parent, slot = node.parent[1:], node.slot[1:]
     row = parent * lanes + lane
     for hop in range(1, -(-children // PAGE)):
-        row = jnp.where(
-            slot >= hop * PAGE, tree.edges[row * ROW + LINK].astype(jnp.int32) * lanes + lane, row
-        )
+        following = tree.edges[row * ROW + LINK].astype(jnp.int32) * lanes + lane
+        row = jnp.where(slot >= hop * PAGE, following, row)
     at = row * ROW + slot % PAGE
     visits, total = tree.edges[at + VISITS], tree.edges[at + RETURNS]
     own = jnp.take_along_axis(node.reward, parent, axis=0)  # up to s

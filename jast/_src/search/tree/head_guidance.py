@@ -12,6 +12,7 @@ import numpy as np
 from jast import distributions as D
 from jast._src.distributions.flat_rows import flat, unflat
 from jast._src.heads.heads import observation, policy_logits, predicted_value, sample_bins
+from jast._src.util.pytrees import select
 
 __all__ = ["Guide", "child_value", "guide", "rolled"]
 
@@ -70,9 +71,8 @@ def rolled(guide, sim, actions, simulation, key, level, state, dist, otherwise):
     key = jax.random.fold_in(key, _HEAD)
     u = jax.random.uniform(key, logits.shape[:1], jnp.float32)
     x = actions.at(unflat(sample_bins(logits, u), D.event_like(dist)), dist)
-    return jax.tree.map(
-        lambda a, b: jnp.where(own & (level < guide.levels), a.astype(b.dtype), b), x, otherwise
-    )
+    x = jax.tree.map(lambda a, b: a.astype(b.dtype), x, otherwise)
+    return select(own & (level < guide.levels), x, otherwise)
 
 
 def child_value(guide, sim, state, x):

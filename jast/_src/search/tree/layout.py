@@ -18,6 +18,7 @@ write, and no tree array is an operand of a select.
  - Returns are those of whole episodes; Q(s, a) subtracts the reward up to s.
 """
 
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -32,7 +33,8 @@ from jast._src.core.transition import advance, begin, blank, conclude
 from jast._src.runtime._jax import is_traced
 from jast._src.search.tree.best_episode import feed_level, follows, no_lead, take_fed
 from jast._src.search.tree.head_guidance import rolled
-from jast._src.search.tree.packing import pack
+from jast._src.search.tree.packing import pack, unpack
+from jast._src.util.pytrees import select
 
 __all__ = [
     "CHILD",
@@ -58,6 +60,7 @@ __all__ = [
     "most_lanes",
     "node_keys",
     "node_shapes",
+    "nodes_of",
     "of_lanes",
     "pages_of",
     "take",
@@ -233,12 +236,9 @@ def _pages(simulations, levels=0, table=None):
 
 def pages_of(problem, simulations):
     """Pages of a tree of so many simulations."""
-    many = problem.values and problem.guide.eager  # children stand on pages before they are visited
-    return (
-        _pages(simulations, levels(problem.sim), problem.settings.widths)
-        if many
-        else _pages(simulations)
-    )
+    if problem.values and problem.guide.eager:  # children stand on pages before they are visited
+        return _pages(simulations, levels(problem.sim), problem.settings.widths)
+    return _pages(simulations)
 
 
 def most_lanes(pages):
@@ -271,29 +271,19 @@ def make(problem, keys, simulations, memoize="node", pages=None, record=False, a
         first = begin(problem.sim, problem.reward, ())
         # an episodic system may be at its end from the start, but a user's evaluation is not called
         # in vain
-        return (
-            first
-            if problem.sim.is_terminal.func is never
-            else conclude(problem.sim, problem.reward, first, first.done)
-        )
+        if problem.sim.is_terminal.func is never:
+            return first
+        return conclude(problem.sim, problem.reward, first, first.done)
 
     first = jax.vmap(origin, in_axes=(axes, 0))(problem, keys)
     dtype = first.reward.dtype
     count = jnp.zeros((lanes,), jnp.int32)
     lead = no_lead(problem, lanes, levels(problem.sim), simulations, dtype)
-    kept = first.state if memoize == "node" else ()
-    node = Node(
-        count,
-        count,
-        first.reward,
-        first.distance,
-        first.failure,
-        first.invalid,
-        kept,
-        count if problem.choice.follow else (),
-        first.log_prob if record else (),
-    )
-    words = jax.vmap(pack)(node)
+    told = first.reward, first.distance, first.failure, first.invalid
+    state = first.state if memoize == "node" else ()
+    source = count if problem.choice.follow else ()
+    log_prob = first.log_prob if record else ()
+    words = jax.vmap(pack)(Node(count, count, *told, state, source, log_prob))
     return Tree(
         key=keys,
         edges=jnp.zeros((pages * lanes * ROW,), dtype),
@@ -323,26 +313,23 @@ def make(problem, keys, simulations, memoize="node", pages=None, record=False, a
 
 def node_shapes(tree, memoize):
     """The `shapes` of one tree's `Node`."""
-    dtype = tree.edges.dtype
-    number, real = jax.ShapeDtypeStruct((), jnp.int32), jax.ShapeDtypeStruct((), dtype)
-    state = (
-        jax.tree.map(lambda a: jax.ShapeDtypeStruct(a.shape[1:], a.dtype), tree.origin)
-        if memoize == "node"
-        else ()
+    number, real, flag = (
+        jax.ShapeDtypeStruct((), dtype) for dtype in (jnp.int32, tree.edges.dtype, jnp.bool_)
     )
-    flag = jax.ShapeDtypeStruct((), jnp.bool_)
-    recorded = not isinstance(tree.trials, tuple)
-    return Node(
-        number,
-        number,
-        real,
-        real,
-        flag,
-        flag,
-        state,
-        number if follows(tree) else (),
-        real if recorded else (),
-    )
+    state = ()
+    if memoize == "node":
+        state = jax.tree.map(lambda a: jax.ShapeDtypeStruct(a.shape[1:], a.dtype), tree.origin)
+    source = number if follows(tree) else ()
+    log_prob = () if isinstance(tree.trials, tuple) else real
+    return Node(number, number, real, real, flag, flag, state, source, log_prob)
+
+
+def nodes_of(tree, memoize, rows):
+    """The `Node` of each of ``rows`` [..., words] of ``tree.nodes``."""
+    unpacked = partial(unpack, like=node_shapes(tree, memoize))
+    for _ in rows.shape[:-1]:
+        unpacked = jax.vmap(unpacked)
+    return unpacked(rows)
 
 
 def choose_child(problem, node_key, slot, state):
@@ -361,10 +348,9 @@ def choose(problem, tree_key, parent, slot, level, state, source=(), fed=()):
     own = choose_child(problem, node_keys(tree_key[None], parent[None])[0], slot, state)
     if not problem.choice.follow:
         return own
-    taken = choose_rollout(
-        problem, jax.random.fold_in(tree_key, source - 1), tree_key, level, state, fed
-    )
-    return jax.tree.map(lambda a, b: jnp.where(source > 0, a, b), taken, own)
+    simulation = jax.random.fold_in(tree_key, source - 1)
+    taken = choose_rollout(problem, simulation, tree_key, level, state, fed)
+    return select(source > 0, taken, own)
 
 
 def choose_rollout(problem, key, tree_key, level, state, fed=()):
@@ -372,19 +358,14 @@ def choose_rollout(problem, key, tree_key, level, state, fed=()):
     what it is fed.
     """
     sim, choice, chosen = problem.sim, problem.choice, signature_of(problem.sim).random_start
-    simulation, key = key, jax.random.fold_in(key, level)
+    guide, simulation, key = problem.guide, key, jax.random.fold_in(key, level)
     x0 = choice.roll(key, tree_key, sim.start(), start=True) if chosen else ()
     dist = sim.disturbance(state)
     x = choice.roll(key, tree_key, dist)
-    if problem.guide != () and problem.guide.heads.policy is not None:
-        x = lax.cond(
-            problem.guide.levels > 0,
-            lambda: rolled(
-                problem.guide, sim, choice.actions, simulation, key, level, state, dist, x
-            ),
-            lambda: x,
-        )
-    if problem.choice.feed:
+    if guide != () and guide.heads.policy is not None:
+        of = guide, sim, choice.actions, simulation, key, level, state, dist, x
+        x = lax.cond(guide.levels > 0, lambda: rolled(*of), lambda: x)
+    if choice.feed:
         x = take_fed(sim, fed, level == feed_level(sim), x)
     return x0, x
 
@@ -398,9 +379,7 @@ def take(problem, level, before, action, rolling=False):
     start = levels(sim) - sim.horizon
     after = advance(sim, reward, before, x, level + 1 - start >= sim.horizon)
     if start and not rolling:
-        after = jax.tree.map(
-            lambda a, b: jnp.where(level == 0, a, b), begin(sim, reward, x0), after
-        )
+        after = select(level == 0, begin(sim, reward, x0), after)
     return after
 
 
@@ -410,12 +389,11 @@ def of_lanes(problem, axes, lane):
     """
     if axes is None:
         return problem
-    return jax.tree.map(
-        lambda axis, leaf: leaf if axis is None else leaf[lane],
-        axes,
-        problem,
-        is_leaf=lambda x: x is None,
-    )
+
+    def of_lane(axis, leaf):
+        return leaf if axis is None else leaf[lane]
+
+    return jax.tree.map(of_lane, axes, problem, is_leaf=lambda x: x is None)
 
 
 def node_keys(keys, node):

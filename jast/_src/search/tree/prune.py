@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jax import lax
 
 from jast._src.search.lanes import select_lanes
-from jast._src.search.tree.best_episode import fed_of, follows
+from jast._src.search.tree.best_episode import fed_source, follows
 from jast._src.search.tree.layout import (
     CHILD,
     LINK,
@@ -19,9 +19,8 @@ from jast._src.search.tree.layout import (
     ROW,
     VISITS,
     choose,
-    node_shapes,
+    nodes_of,
 )
-from jast._src.search.tree.packing import unpack
 from jast._src.search.tree.simulate import child_state, replay_to
 from jast._src.util import display
 
@@ -61,23 +60,20 @@ def prune(problem, tree, children, memoize="node", axes=None):
     searching = tree.alive & ~tree.ended
     state = _root_state(problem, axes, tree, memoize)
     tree = _add_turn(tree)
-    rows, visits, total, child, reward = _children(tree, children)
+    pages, visits, total, child, reward = _children(tree, children)
     q = problem.q_value(total, visits, tree.root_reward[:, None])
 
     slots, lane = jnp.arange(children, dtype=jnp.int32), jnp.arange(len(root), dtype=jnp.int32)
     source, fed = (), ()
     if follows(tree):
-        like = node_shapes(tree, memoize)
-        known = jax.vmap(jax.vmap(lambda w: unpack(w, like).source))(
-            tree.nodes[jnp.abs(child).astype(jnp.int32), lane[:, None]]
-        )
-        source = jnp.where(visits > 0, known, 0)
-        fed = fed_of(tree, jnp.maximum(source - 1, 0), lane[:, None])
+        rows = tree.nodes[jnp.abs(child).astype(jnp.int32), lane[:, None]]
+        source = jnp.where(visits > 0, nodes_of(tree, memoize, rows).source, 0)
+        fed = fed_source(tree, source, lane[:, None])
 
     def draw(p, key, root, level, state, *of):
         return jax.vmap(lambda slot, *of: choose(p, key, root, slot, level, state, *of))(slots, *of)
 
-    starts, actions = jax.vmap(draw, in_axes=(axes, 0, 0, 0, 0, 0, 0))(
+    starts, actions = jax.vmap(draw, in_axes=(axes, *[0] * 6))(
         problem, tree.key, root, level, state, source, fed
     )
     roots = Roots(state, level, actions, starts, visits.astype(jnp.int32), q, searching)
@@ -87,7 +83,7 @@ def prune(problem, tree, children, memoize="node", axes=None):
     move = searching & (n > 0)
     new = jnp.where(move, jnp.abs(to).astype(jnp.int32), root)
     place = jnp.arange(tree.trail.shape[0], dtype=jnp.int32)[:, None]
-    edge = _pick(rows, slot // PAGE) * ROW + slot % PAGE
+    edge = _pick(pages, slot // PAGE) * ROW + slot % PAGE
     tree = tree._replace(
         path=jnp.where(move[None] & (place[:-1] == level[None]), edge[None], tree.path),
         trail=jnp.where(move[None] & (place == level[None] + 1), new[None], tree.trail),
@@ -104,7 +100,7 @@ def prune(problem, tree, children, memoize="node", axes=None):
         )
     if memoize == "root":
         of = jax.tree.map(lambda a: jax.vmap(lambda row, j: row[j])(a, slot), (source, fed))
-        after = jax.vmap(child_state, in_axes=(axes, 0, 0, 0, 0, 0, 0, 0))(
+        after = jax.vmap(child_state, in_axes=(axes, *[0] * 7))(
             problem, tree.key, root, slot, level, state, *of
         )
         tree = tree._replace(base=select_lanes(move, after, state))
@@ -116,11 +112,10 @@ def recounted(problem, tree, roots, children, memoize="node"):
     its end, when the simulations of later roots have gone through one child of each.
     """
     lane = jnp.arange(len(tree.root), dtype=jnp.int32)
-    like = node_shapes(tree, memoize)
 
     def one(root):
         node = tree.trail[root.depth, lane]
-        reward = jax.vmap(lambda w: unpack(w, like).reward)(tree.nodes[node, lane])
+        reward = nodes_of(tree, memoize, tree.nodes[node, lane]).reward
         _, visits, total, *_ = _children(tree._replace(root=node), children)
         q = problem.q_value(total, visits, reward[:, None])
         count = jnp.where(root.valid[:, None], visits, 0).astype(jnp.int32)
@@ -167,9 +162,8 @@ def _children(tree, children):
 
 def _root_state(problem, axes, tree, memoize):
     if memoize == "node":
-        (lanes,) = tree.key.shape
-        like = node_shapes(tree, memoize)
-        return jax.vmap(lambda w: unpack(w, like).state)(tree.nodes[tree.root, jnp.arange(lanes)])
+        rows = tree.nodes[tree.root, jnp.arange(len(tree.root))]
+        return nodes_of(tree, memoize, rows).state
     if memoize == "root":
         return tree.base
     return replay_to(problem, axes, tree, tree.trail, tree.depth, memoize)[0]

@@ -8,18 +8,18 @@ from jax import lax
 
 from jast._src.core.episode import Episode
 from jast._src.core.transition import blank
-from jast._src.search.tree.best_episode import fed_of
+from jast._src.search.tree.best_episode import fed_of, fed_source
 from jast._src.search.tree.layout import (
     FAILURE,
     FRESH,
     choose,
     choose_rollout,
     levels,
-    node_shapes,
+    nodes_of,
     of_lanes,
     take,
 )
-from jast._src.search.tree.packing import unpack
+from jast._src.util.pytrees import select, zero_where
 
 __all__ = ["rebuild"]
 
@@ -35,14 +35,13 @@ def rebuild(problem, tree, lane, i, memoize="node", axes=None):
 
 def _one(problem, axes, tree, lane, i, memoize):
     problem = of_lanes(problem, axes, lane)
-    like, key, sim = node_shapes(tree, memoize), tree.key[lane], problem.sim
-    height = levels(sim)
+    key, sim, height = tree.key[lane], problem.sim, levels(problem.sim)
     outcome = tree.outcome[i, lane]
     leaf = jnp.where(((outcome & FRESH) > 0) & ~tree.ended[lane], i + 1, 0)
 
     def up(node, _):
-        record = unpack(tree.nodes[node, lane], like)
-        return record.parent, (node, record.parent, record.slot, record.source)
+        of = nodes_of(tree, memoize, tree.nodes[node, lane])
+        return of.parent, (node, of.parent, of.slot, of.source)
 
     _, (nodes, parents, slots, sources) = lax.scan(up, leaf, None, length=height)
     # choices made in the tree; those of the rollout follow
@@ -52,34 +51,18 @@ def _one(problem, axes, tree, lane, i, memoize):
 
     def down(at, level):
         up_there = jnp.clip(depth - 1 - level, 0, height - 1)
-        source = jax.tree.map(lambda a: a[up_there], sources)
-        of = (
-            (source, fed_of(tree, jnp.maximum(source - 1, 0), lane))
-            if problem.choice.follow
-            else ()
-        )
-        chosen = choose(problem, key, parents[up_there], slots[up_there], level, at.state, *of)
+        parent, slot, source = jax.tree.map(lambda a: a[up_there], (parents, slots, sources))
+        taken = source, fed_source(tree, source, lane)
+        chosen = choose(problem, key, parent, slot, level, at.state, *taken)
         rolled = choose_rollout(problem, rolling, key, level, at.state, fed_of(tree, i, lane))
-        x0, x = action = jax.tree.map(lambda a, b: jnp.where(level < depth, a, b), chosen, rolled)
-        after = take(problem, level, at, action)
-        kept = jax.tree.map(lambda a, b: jnp.where(at.done, a, b), at, after)
-        return kept, (
-            x0,
-            jax.tree.map(lambda a: jnp.where(at.done, jnp.zeros((), a.dtype), a), x),
-            ~at.done,
-        )
+        x0, x = action = select(level < depth, chosen, rolled)
+        after = select(at.done, at, take(problem, level, at, action))
+        return after, (x0, zero_where(at.done, x), ~at.done)
 
     start = blank(sim, begin)._replace(done=tree.ended[lane])
     end, (x0s, xs, lived) = lax.scan(down, start, jnp.arange(height, dtype=jnp.int32))
     first = height - sim.horizon
     x0 = jax.tree.map(lambda a: a[0], x0s)
     steps = jnp.sum(lived[first:], dtype=jnp.int32)
-    return Episode(
-        x0,
-        jax.tree.map(lambda a: a[first:], xs),
-        end.log_prob,
-        end.distance,
-        (outcome & FAILURE) > 0,
-        steps,
-        tree.log[i, lane],
-    )
+    xs, failure = jax.tree.map(lambda a: a[first:], xs), (outcome & FAILURE) > 0
+    return Episode(x0, xs, end.log_prob, end.distance, failure, steps, tree.log[i, lane])

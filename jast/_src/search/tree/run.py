@@ -181,18 +181,12 @@ def _one_group(turn: Round, number: int, context: UnitContext) -> TreeBatch:
     )
     lane, i = _candidates(log, outcome, candidates)
     wanted = candidates + len(group)
-    found = _rebuild(
-        problem,
-        tree,
-        np.resize(lane, wanted).astype(np.int32),
-        np.resize(i, wanted).astype(np.int32),
-        plan.memoize,
-    )
+    rows = (np.resize(a, wanted).astype(np.int32) for a in (lane, i))
+    found = _rebuild(problem, tree, *rows, plan.memoize)
     found = jax.tree.map(lambda a: a[: len(lane)], jax.device_get(found))
-    roots = jax.tree.map(
-        lambda *rows: np.stack([*rows, *[np.zeros_like(rows[0])] * (plan.prunes - len(rows))]),
-        *turns,
-    )
+    none = jax.tree.map(np.zeros_like, turns[0])
+    turns += [none] * (plan.prunes - len(turns))
+    roots = jax.tree.map(lambda *rows: np.stack(rows), *turns)
     if plan.recount:
         roots = jax.device_get(_recounted(problem, tree, roots, plan.children, plan.memoize))
     roots = jax.tree.map(lambda a: a[:, : len(group)], roots)
@@ -266,17 +260,12 @@ def _batchable(treedef: Any, plan: Plan, axes: tuple) -> Callable[..., Traced]:
         lanes = keys.shape[1]
 
         def spread(leaf, is_batched, axis):
+            if not is_batched and axis is None:
+                return leaf, None
             if not is_batched:
-                return (
-                    (leaf, None)
-                    if axis is None
-                    else (jnp.tile(leaf, (size,) + (1,) * (leaf.ndim - 1)), 0)
-                )
-            leaf = (
-                leaf
-                if axis == 0
-                else jnp.broadcast_to(leaf[:, None], (size, lanes, *leaf.shape[1:]))
-            )
+                return jnp.tile(leaf, (size,) + (1,) * (leaf.ndim - 1)), 0
+            if axis is None:
+                leaf = jnp.broadcast_to(leaf[:, None], (size, lanes, *leaf.shape[1:]))
             return leaf.reshape(size * lanes, *leaf.shape[2:]), 0
 
         pairs = [spread(*each) for each in zip(leaves, leaf_batched, axes, strict=True)]
@@ -308,11 +297,12 @@ def _traced(problem, axes, keys, plan):
     found = rebuild(problem, tree, lane, best, plan.memoize, axes)
     first = jnp.where(jnp.any(failed, axis=0), jnp.argmax(failed, axis=0), len(tree.log))
     count = partial(jnp.sum, axis=0, dtype=jnp.int32)
-    exact = jax.vmap(
-        lambda p, e: play_back(p.sim, p.reward, e.x0, e.disturbances, e.length), in_axes=(axes, 0)
-    )(problem, found)
+
+    def played(problem, e):
+        return play_back(problem.sim, problem.reward, e.x0, e.disturbances, e.length)
+
     return Traced(
-        best=exact,
+        best=jax.vmap(played, in_axes=(axes, 0))(problem, found),
         failures=count(failed),
         episodes=count(ran),
         steps=tree.steps,

@@ -8,8 +8,9 @@ from jax import lax
 
 from jast._src.search.tree.best_episode import follows
 from jast._src.search.tree.layout import CHILD, LINK, PAGE, RETURNS, REWARD, ROW, VISITS
+from jast._src.util.pytrees import select
 
-__all__ = ["Best", "Walk", "select"]
+__all__ = ["Best", "Walk", "walk_down"]
 
 
 class Best(NamedTuple):
@@ -59,7 +60,7 @@ class Walk(NamedTuple):
     """
 
 
-def select(problem, tree):
+def walk_down(problem, tree):
     """Walk down to a child that was never visited, or to an episode's end: MCFS-AP eq. 3 and
     progressive widening, a page an iteration.
     """
@@ -68,10 +69,8 @@ def select(problem, tree):
     lanes = tree.key.shape[0]
     lane = jnp.arange(lanes, dtype=jnp.int32)
     edges, dtype = tree.edges, tree.edges.dtype
-    slots, columns = (
-        jnp.arange(PAGE + 1, dtype=jnp.int32)[None],
-        jnp.array([[CHILD, REWARD]], jnp.int32),
-    )
+    slots = jnp.arange(PAGE + 1, dtype=jnp.int32)[None]
+    columns = jnp.array([[CHILD, REWARD]], jnp.int32)
     exploration = jnp.broadcast_to(jnp.asarray(settings.exploration, dtype), (lanes,))
     nil = jnp.zeros((lanes,), jnp.int32)
 
@@ -86,32 +85,25 @@ def select(problem, tree):
         grows = width(visits + 1) > count if eager else ()
         return count, grows, exploration * jnp.sqrt(jnp.log(visits.astype(dtype)))
 
-    def read(w):
-        """Visits and returns of the pages, laid out on the desk (see `Tree.desk`)."""
-        rows = edges.reshape(-1, CHILD)[w.row * (ROW // CHILD)]
-        desk = lax.dynamic_update_slice_in_dim(w.desk, rows[None], first, 0)
+    def lay_out(desk, rows):
+        """``rows`` on the desk, to be read from there (see `Tree.desk`): the desk and they."""
+        desk = lax.dynamic_update_slice_in_dim(desk, rows[None], first, 0)
         return desk, desk[0]
 
     def number(a):  # of all trees or of each
         return jnp.asarray(a, dtype).reshape(-1, 1)
 
-    def pick(row, column, j):
-        return jnp.take_along_axis(row, (column + j)[:, None], axis=1, mode="promise_in_bounds")[
-            :, 0
-        ]
+    def pick(row, at):
+        return jnp.take_along_axis(row, at[:, None], axis=1, mode="promise_in_bounds")[:, 0]
 
     def body(w):
-        desk, row = read(w)
+        desk, row = lay_out(w.desk, edges.reshape(-1, CHILD)[w.row * (ROW // CHILD)])
         n, total = row[:, VISITS:RETURNS], row[:, RETURNS:CHILD]
         q = problem.q_value(total, n, w.reward[:, None])
+        values = ()
         if valued:
-            values = lax.dynamic_update_slice_in_dim(
-                w.values, tree.values.reshape(-1, PAGE + 1)[w.row][None], first, 0
-            )
-            v = values[0]
+            values, v = lay_out(w.values, tree.values.reshape(-1, PAGE + 1)[w.row])
             q = number(guide.q_weight) * q + number(guide.v_weight) * v
-        else:
-            values = ()
         if problem.choice.urgent:  # thesis Algorithm 10
             score = jnp.where(n > 0, q + w.bonus[:, None] / jnp.sqrt(jnp.maximum(n, 1)), jnp.inf)
         else:
@@ -120,25 +112,20 @@ def select(problem, tree):
         if valued and not eager:  # one that was not tried yet stands after those that were
             there &= (slots == 0) | (n > 0) | (jnp.roll(n, 1, axis=1) > 0)
         score = jnp.where(there, score, -jnp.inf)
-        scores = lax.dynamic_update_slice_in_dim(w.scores, score[None], first, 0)
-        score = scores[0]
+        scores, score = lay_out(w.scores, score)
         j = jnp.argmax(score, axis=1).astype(jnp.int32)
-        top = pick(score, 0, j)
+        top = pick(score, j)
         edge, link = w.row * ROW + j, row[:, LINK]
         better = top > w.best.score  # the first maximum wins
         edge = jnp.where(better, edge, w.best.edge)
-        below = lax.dynamic_update_slice_in_dim(
-            w.below, edges[edge[:, None] + columns][None], first, 0
-        )
-        child, reward = below[0, :, 0].astype(jnp.int32), below[0, :, 1]
-        visits = jnp.where(better, pick(row, VISITS, j).astype(jnp.int32), w.best.visits)
+        below, told = lay_out(w.below, edges[edge[:, None] + columns])
         found = Best(
-            jnp.where(better, top, w.best.score),
-            edge,
-            jnp.where(better, w.offset + j, w.best.slot),
-            visits,
-            child,
-            reward,
+            score=jnp.where(better, top, w.best.score),
+            edge=edge,
+            slot=jnp.where(better, w.offset + j, w.best.slot),
+            visits=jnp.where(better, pick(row, VISITS + j).astype(jnp.int32), w.best.visits),
+            child=told[:, 0].astype(jnp.int32),
+            reward=told[:, 1],
         )
         # without a link there is an unvisited slot here, and later ones score the same; with values
         # all pages are linked
@@ -147,79 +134,65 @@ def select(problem, tree):
         descend = taken & (found.child > 0)
         count, grows, bonus = of_node(found.visits)
         level = jnp.where(taken, w.depth, w.path.shape[0])
+        next_page = link.astype(jnp.int32) * lanes + lane
+        first_page = found.child * lanes + lane
+        deeper = jnp.where(descend, w.depth + 1, w.trail.shape[0])
+        ahead = found._replace(score=jnp.where(descend, -jnp.inf, found.score))
+        last, new = w.last, w.new
+        if eager:
+            last = last.at[level, lane].set(w.row, mode="drop")
+            new = new.at[level, lane].set(jnp.where(w.grows, w.count, 0), mode="drop")
         return Walk(
             node=jnp.where(descend, found.child, w.node),
-            row=jnp.where(
-                more,
-                link.astype(jnp.int32) * lanes + lane,
-                jnp.where(descend, found.child * lanes + lane, w.row),
-            ),
+            row=jnp.where(more, next_page, jnp.where(descend, first_page, w.row)),
             offset=jnp.where(more, w.offset + PAGE, 0),
             count=jnp.where(descend, count, w.count),
             grows=jnp.where(descend, grows, w.grows) if eager else (),
             bonus=jnp.where(descend, bonus, w.bonus),
             reward=jnp.where(descend, found.reward, w.reward),
             depth=w.depth + descend.astype(jnp.int32),
-            best=jax.tree.map(
-                lambda a, b: jnp.where(w.done, b, a),
-                found._replace(score=jnp.where(descend, -jnp.inf, found.score)),
-                w.best,
-            ),
+            best=select(w.done, w.best, ahead),
             done=w.done | (taken & (found.child <= 0)),
             path=w.path.at[level, lane].set(found.edge, mode="drop"),
             desk=desk,
             scores=scores,
             below=below,
-            trail=w.trail.at[jnp.where(descend, w.depth + 1, w.trail.shape[0]), lane].set(
-                found.child, mode="drop"
-            ),
+            trail=w.trail.at[deeper, lane].set(found.child, mode="drop"),
             values=values,
-            last=w.last.at[level, lane].set(w.row, mode="drop") if eager else (),
-            new=(
-                w.new.at[level, lane].set(jnp.where(w.grows, w.count, 0), mode="drop")
-                if eager
-                else ()
-            ),
+            last=last,
+            new=new,
         )
 
-    node, visits, reward, depth, path, trail = (
-        tree.root,
-        tree.root_visits,
-        tree.root_reward,
-        tree.depth,
-        tree.path,
-        tree.trail,
-    )
+    place = tree.root, tree.root_visits, tree.root_reward, tree.depth, tree.path, tree.trail
     # straight to the last node of the best episode's path, which was visited once
     if follows(tree):
-        lead = tree.lead
-        place = (lead.node, jnp.ones_like(visits), lead.reward, lead.depth, lead.path, lead.trail)
-        root = (node, visits, reward, depth, path, trail)
-        node, visits, reward, depth, path, trail = (
+        lead, once = tree.lead, jnp.ones_like(tree.root_visits)
+        end = lead.node, once, lead.reward, lead.depth, lead.path, lead.trail
+        place = (
             jnp.where(lead.on if a.ndim == 1 else lead.on[None], a, b)
-            for a, b in zip(place, root, strict=True)
+            for a, b in zip(end, place, strict=True)
         )
-    row = node * lanes + lane
+    node, visits, reward, depth, path, trail = place
     count, grows, bonus = of_node(visits)
-    nobody = Best(
-        jnp.full((lanes,), -jnp.inf, dtype), nil, nil, nil, nil, jnp.zeros((lanes,), dtype)
-    )
-    stay = ~tree.alive | tree.ended
+    zero = jnp.zeros((lanes,), dtype)
     start = Walk(
-        node,
-        row,
-        nil,
-        count,
-        grows,
-        bonus,
-        reward,
-        depth,
-        nobody,
-        stay,
-        path,
-        trail,
-        *(jnp.zeros((2, lanes, n), dtype) for n in (CHILD, PAGE + 1, 2)),
-        jnp.zeros((2, lanes, PAGE + 1), dtype) if valued else (),
-        *(jnp.zeros(tree.path.shape, jnp.int32) if eager else () for _ in range(2)),
+        node=node,
+        row=node * lanes + lane,
+        offset=nil,
+        count=count,
+        grows=grows,
+        bonus=bonus,
+        reward=reward,
+        depth=depth,
+        best=Best(zero - jnp.inf, nil, nil, nil, nil, zero),
+        done=~tree.alive | tree.ended,
+        path=path,
+        trail=trail,
+        desk=jnp.zeros((2, lanes, CHILD), dtype),
+        scores=jnp.zeros((2, lanes, PAGE + 1), dtype),
+        below=jnp.zeros((2, lanes, 2), dtype),
+        values=jnp.zeros((2, lanes, PAGE + 1), dtype) if valued else (),
+        last=jnp.zeros(tree.path.shape, jnp.int32) if eager else (),
+        new=jnp.zeros(tree.path.shape, jnp.int32) if eager else (),
     )
     return lax.while_loop(lambda w: jnp.any(~w.done), body, start)

@@ -9,6 +9,7 @@ from jast._src.search.lanes import select_lanes
 from jast._src.search.tree.best_episode import (
     Lead,
     fed_of,
+    fed_source,
     feed_level,
     follows,
     packed,
@@ -31,12 +32,13 @@ from jast._src.search.tree.layout import (
     choose,
     choose_rollout,
     levels,
-    node_shapes,
+    nodes_of,
     of_lanes,
     take,
 )
-from jast._src.search.tree.packing import pack, unpack
-from jast._src.search.tree.select import select
+from jast._src.search.tree.packing import pack
+from jast._src.search.tree.select import walk_down
+from jast._src.util.pytrees import select
 
 __all__ = ["child_state", "grow", "replay_to"]
 
@@ -54,7 +56,7 @@ def grow(problem, tree, begin_at, end_at, memoize="node", axes=None):
 def _simulation(problem, axes, tree, i, memoize):
     lanes = tree.key.shape[0]
     lane = jnp.arange(lanes, dtype=jnp.int32)
-    walk = select(problem, tree)
+    walk = walk_down(problem, tree)
     fresh = tree.alive & ~tree.ended & (walk.best.child == 0)
     nothing = jnp.zeros((lanes,), bool)
     zero = jnp.zeros((lanes,), tree.edges.dtype)
@@ -72,36 +74,19 @@ def _simulation(problem, axes, tree, i, memoize):
         desk = lax.dynamic_update_slice_in_dim(
             tree.desk, tree.nodes[at, lane][None], jnp.minimum(i, 0), 0
         )
-        like = node_shapes(tree, memoize)
-        node = jax.vmap(lambda w: unpack(w, like))(desk[0])
-        state, replayed = (
-            (node.state, jnp.zeros_like(at))
-            if memoize == "node"
-            else replay_to(problem, axes, tree, walk.trail, walk.depth, memoize)
-        )
-        so_far = node.log_prob if recorded else zero
-        before = Progress(
-            state,
-            so_far,
-            walk.reward,
-            node.distance,
-            nothing,
-            nothing,
-            nothing,
-            zero if episodic else (),
-        )
-        of = (source, fed_of(tree, jnp.maximum(source - 1, 0), lane)) if follows(tree) else ((), ())
-        child = jax.vmap(_child, in_axes=(axes, 0, 0, 0, 0, 0, 0, 0))(
-            problem, tree.key, walk.node, walk.best.slot, walk.depth, before, *of
-        )
+        node = nodes_of(tree, memoize, desk[0])
+        if memoize == "node":
+            state, replayed = node.state, jnp.zeros_like(at)
+        else:
+            state, replayed = replay_to(problem, axes, tree, walk.trail, walk.depth, memoize)
+        so_far, owed = node.log_prob if recorded else zero, zero if episodic else ()
+        flags = nothing, nothing, nothing
+        before = Progress(state, so_far, walk.reward, node.distance, *flags, owed)
+        of = walk.node, walk.best.slot, walk.depth, before, source, fed_source(tree, source, lane)
+        child = jax.vmap(_child, in_axes=(axes, *[0] * 7))(problem, tree.key, *of)
         known = node.reward, node.failure, node.invalid, (node.distance, so_far) if recorded else ()
-        return (
-            desk,
-            without_log_p(child),
-            replayed,
-            known,
-            fed_of(tree, jnp.zeros_like(lane) + i, lane),
-        )
+        fed = fed_of(tree, jnp.zeros_like(lane) + i, lane)
+        return desk, without_log_p(child), replayed, known, fed
 
     # in a conditional, so that all reads of the tree are over before the first write: otherwise XLA
     # copies the tree
@@ -121,12 +106,10 @@ def _simulation(problem, axes, tree, i, memoize):
     def roll(carry):
         level, steps, at, taken = carry
         live = ~at.done
-        after, x = jax.vmap(_rolled, in_axes=(axes, 0, 0, 0, 0, 0))(
+        after, x = jax.vmap(_rolled, in_axes=(axes, *[0] * 5))(
             problem, key, tree.key, level, at, fed
         )
-        kept = jax.tree.map(
-            lambda a, b: jnp.where(live, b, a), at._replace(state=()), after._replace(state=())
-        )
+        kept = select(live, after._replace(state=()), at._replace(state=()))
         if problem.choice.feed:
             here = live & (level == middle)
             taken = jnp.where(here[:, None], jax.vmap(packed)(here, x), taken)
@@ -135,85 +118,61 @@ def _simulation(problem, axes, tree, i, memoize):
 
     # a random start is a level, but no step
     steps = _one(fresh & (walk.depth >= levels(problem.sim) - problem.sim.horizon))
-    carry = (
-        walk.depth + 1,
-        steps,
-        child._replace(done=child.done | ~fresh),
-        jnp.zeros_like(fed) if problem.choice.feed else (),
-    )
+    taken = jnp.zeros_like(fed) if problem.choice.feed else ()
+    carry = walk.depth + 1, steps, child._replace(done=child.done | ~fresh), taken
     _, steps, end, taken = lax.while_loop(lambda c: jnp.any(~c[2].done), roll, carry)
     if episodic:
         end = jax.vmap(lambda p, e, live: conclude(p.sim, p.reward, e, live), in_axes=(axes, 0, 0))(
             problem, end, fresh
         )
-        child = jax.tree.map(
-            lambda a, b: jnp.where(child.done, b, a),
-            child._replace(state=()),
-            end._replace(state=()),
-        )._replace(state=child.state)
+        ended = end._replace(state=()), child._replace(state=())
+        child = select(child.done, *ended)._replace(state=child.state)
 
     value = jnp.where(fresh, end.reward, known_reward)
     finite = jnp.isfinite(value)
     worst = jnp.where(finite & tree.alive, jnp.minimum(tree.worst, value), tree.worst)
     backed = jnp.where(finite, value, jnp.where(jnp.isfinite(worst), worst, 0))
     first = tree.ended & tree.alive
-    failed, invalid = (
-        jnp.where(fresh, end.failure, known_failure),
-        jnp.where(fresh, end.invalid, known_invalid),
-    )
-    bits = (
-        _bit(fresh | first, FRESH) | _bit(failed, FAILURE) | _bit(invalid, INVALID) | jnp.uint8(RAN)
-    )
-    bits = jnp.where(tree.alive, bits, 0).astype(jnp.uint8)
+    failed = jnp.where(fresh, end.failure, known_failure)
+    invalid = jnp.where(fresh, end.invalid, known_invalid)
+    bits = _bit(fresh | first, FRESH) | _bit(failed, FAILURE) | _bit(invalid, INVALID)
+    bits = jnp.where(tree.alive, bits | jnp.uint8(RAN), 0).astype(jnp.uint8)
     state = child.state if memoize == "node" else ()
     numbers = child.reward, child.distance, child.failure, child.invalid
-    kept = Node(
-        walk.node, walk.best.slot, *numbers, state, source, child.log_prob if recorded else ()
-    )
-    trial = (
-        tuple(
-            jnp.where(fresh, a, b)
-            for a, b in zip((end.distance, end.log_prob), known_trial, strict=True)
-        )
-        if recorded
-        else ()
-    )
+    log_prob = child.log_prob if recorded else ()
+    kept = Node(walk.node, walk.best.slot, *numbers, state, source, log_prob)
+
+    def put(into, row, at):
+        return lax.dynamic_update_slice_in_dim(into, row[None], at, 0)
+
+    lead, trials = tree.lead, tree.trials
+    if isinstance(lead, Lead):
+        lead = update_lead(tree, walk, fresh, child, value, failed, i, taken)
+    if recorded:
+        trial = select(fresh, (end.distance, end.log_prob), known_trial)
+        trials = put(trials, jnp.stack(trial), i)
     tree = tree._replace(
         edges=_back_up(tree, walk, fresh, child, backed, i + 1, link=not problem.values),
-        nodes=lax.dynamic_update_slice_in_dim(tree.nodes, jax.vmap(pack)(kept)[None], i + 1, 0),
+        nodes=put(tree.nodes, jax.vmap(pack)(kept), i + 1),
         desk=desk,
         pages=tree.pages if problem.values else tree.pages + _one(fresh & _fills(walk)),
         root_visits=tree.root_visits + _one(tree.alive),
         turn=tree.turn + jnp.where(tree.alive, jnp.stack([jnp.ones_like(backed), backed]), 0),
         worst=worst,
         steps=tree.steps + steps + jnp.where(fresh, replayed, 0),
-        log=lax.dynamic_update_slice_in_dim(tree.log, value[None], i, 0),
-        outcome=lax.dynamic_update_slice_in_dim(tree.outcome, bits[None], i, 0),
+        log=put(tree.log, value, i),
+        outcome=put(tree.outcome, bits, i),
         alive=tree.alive & ~tree.ended,
-        lead=(
-            update_lead(tree, walk, fresh, child, value, failed, i, taken)
-            if isinstance(tree.lead, Lead)
-            else ()
-        ),
-        trials=(
-            lax.dynamic_update_slice_in_dim(tree.trials, jnp.stack(trial)[None], i, 0)
-            if recorded
-            else ()
-        ),
+        lead=lead,
+        trials=trials,
     )
     if not problem.values:
         return tree
-    return evaluate_children(
-        problem,
-        axes,
-        tree,
-        walk,
-        fresh,
-        lambda lane, level, live: replay_to(
-            problem, axes, tree, walk.trail, level, memoize, lane, live
-        ),
-        memoize,
-    )
+
+    def replay(lane, level, live):
+        return replay_to(problem, axes, tree, walk.trail, level, memoize, lane, live)
+
+    return evaluate_children(problem, axes, tree, walk, fresh, replay, memoize)
 
 
 def _back_up(tree, walk, fresh, child, value, new, link):
@@ -223,16 +182,13 @@ def _back_up(tree, walk, fresh, child, value, new, link):
     nowhere = tree.edges.size
     level = jnp.arange(tree.path.shape[0], dtype=jnp.int32)[:, None]
     last = walk.depth + _one(tree.alive & ~tree.ended)
-    at = jnp.where((level >= tree.depth[None]) & (level < last[None]), walk.path, nowhere).reshape(
-        -1
-    )
+    between = (level >= tree.depth[None]) & (level < last[None])
+    at = jnp.where(between, walk.path, nowhere).reshape(-1)
     ids = jnp.where(child.done, -new, new).astype(tree.edges.dtype)
     slot = jnp.where(fresh, walk.best.edge, nowhere)
     returns = jnp.broadcast_to(value[None], walk.path.shape).reshape(-1)
-    places, values = (
-        [at + VISITS, at + RETURNS, slot + CHILD, slot + REWARD],
-        [jnp.ones_like(returns), returns, ids, child.reward],
-    )
+    places = [at + VISITS, at + RETURNS, slot + CHILD, slot + REWARD]
+    values = [jnp.ones_like(returns), returns, ids, child.reward]
     if link:  # where the page is full now, another goes on
         places.append(jnp.where(fresh & _fills(walk), walk.best.edge // ROW * ROW + LINK, nowhere))
         values.append(tree.pages.astype(tree.edges.dtype))
@@ -250,34 +206,23 @@ def replay_to(problem, axes, tree, trail, depth, memoize, lane=None, live=None):
 
     Or of the trees ``lane`` [m], ``depth`` [m], where ``live`` [m].
     """
-    like = node_shapes(tree, memoize)
-    key, base, first = (
-        tree.key,
-        tree.base,
-        tree.depth if memoize == "root" else jnp.zeros_like(tree.depth),
-    )
+    first = tree.depth if memoize == "root" else jnp.zeros_like(tree.depth)
+    start = tree.key, tree.base, first
     running = tree.alive & ~tree.ended if live is None else live
     if lane is None:
-        lane = jnp.arange(key.shape[0], dtype=jnp.int32)
+        lane = jnp.arange(tree.key.shape[0], dtype=jnp.int32)
     else:
-        problem, key, base, first = (
-            of_lanes(problem, axes, lane),
-            key[lane],
-            jax.tree.map(lambda a: a[lane], base),
-            first[lane],
-        )
-    move = jax.vmap(child_state, in_axes=(axes, 0, 0, 0, 0, 0, 0, 0))
+        problem = of_lanes(problem, axes, lane)
+        start = jax.tree.map(lambda a: a[lane], start)
+    key, base, first = start
+    move = jax.vmap(child_state, in_axes=(axes, *[0] * 7))
 
     def body(carry):
         level, state = carry
-        node = jax.vmap(lambda w: unpack(w, like))(tree.nodes[trail[level + 1, lane], lane])
+        node = nodes_of(tree, memoize, tree.nodes[trail[level + 1, lane], lane])
         live = running & (level < depth)
-        of = (
-            (node.source, fed_of(tree, jnp.maximum(node.source - 1, 0), lane))
-            if follows(tree)
-            else ((), ())
-        )
-        after = move(problem, key, node.parent, node.slot, level, state, *of)
+        taken = node.source, fed_source(tree, node.source, lane)
+        after = move(problem, key, node.parent, node.slot, level, state, *taken)
         return level + _one(live), select_lanes(live, after, state)
 
     _, state = lax.while_loop(lambda c: jnp.any(running & (c[0] < depth)), body, (first, base))
@@ -286,12 +231,8 @@ def replay_to(problem, axes, tree, trail, depth, memoize, lane=None, live=None):
 
 
 def _child(problem, tree_key, parent, slot, level, before, source, fed):
-    return take(
-        problem,
-        level,
-        before,
-        choose(problem, tree_key, parent, slot, level, before.state, source, fed),
-    )
+    action = choose(problem, tree_key, parent, slot, level, before.state, source, fed)
+    return take(problem, level, before, action)
 
 
 def _rolled(problem, key, tree_key, level, before, fed):
@@ -301,9 +242,8 @@ def _rolled(problem, key, tree_key, level, before, fed):
 
 def child_state(problem, tree_key, parent, slot, level, state, source=(), fed=()):
     """One lane: the simulator's state at a node's child."""
-    return _child(
-        problem, tree_key, parent, slot, level, blank(problem.sim, state), source, fed
-    ).state
+    before = blank(problem.sim, state)
+    return _child(problem, tree_key, parent, slot, level, before, source, fed).state
 
 
 def _one(pred):
