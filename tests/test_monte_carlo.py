@@ -77,7 +77,7 @@ def test_counts_are_those_of_the_episodes(key):
     tree = module.tree_keys(key, 1)[0]
     one = jax.jit(
         lambda i: (
-            module._play(
+            module.play_drawn(
                 tree,
                 sim,
                 rewards.standard(),

@@ -23,8 +23,9 @@ from jast._src.core.simulator import Simulator
 from jast._src.runtime._jax import is_tracing, jit
 from jast._src.runtime.host_errors import runs_on_host
 from jast._src.runtime.jax_settings import run_in_thread
-from jast._src.search.lanes import NEVER, Played, Tally, blank_episodes, play_lanes
+from jast._src.search.lanes import NEVER, Tally, blank_episodes, play_drawn
 from jast._src.search.result import SearchResult
+from jast._src.util.pytrees import select
 
 __all__ = ["Calibration", "calibrate", "with_calibration"]
 
@@ -72,11 +73,9 @@ def calibrate(sim: Simulator, density: str, widen: str) -> Calibration:
     widths = WIDTHS[:1] if widen == "never" else WIDTHS
 
     work = partial(_calibrated, sim, density, widths, widen == "blind", lanes)
-    return (
-        run_in_thread(lambda: jax.block_until_ready(work()))
-        if host and not is_tracing()
-        else work()
-    )
+    if not host or is_tracing():
+        return work()
+    return run_in_thread(lambda: jax.block_until_ready(work()))
 
 
 @partial(jit, static_argnames=("density", "widths", "blind", "lanes"))
@@ -87,21 +86,11 @@ def _calibrated(
     live, number = jnp.ones((lanes,), bool), jnp.arange(lanes, dtype=jnp.int32)
     table, reward = jnp.asarray(widths, real), LogLikelihood(density)
 
-    def play(i: jax.Array) -> Played:
-        keys = jax.vmap(jax.random.fold_in, (None, 0))(key, i * lanes + number)
-        drawn = actions.wide(table[i]) if len(widths) > 1 else actions.samples()
-
-        def draw_start(key, row, dist):
-            return drawn.draw_start(key, dist)
-
-        def draw(key, row, dist):
-            return drawn.draw(key, dist)
-
-        return play_lanes(sim, reward, keys, draw_start, draw, live, record=True)
-
     def body(carry: Any) -> Any:
         i, _, shares, nearest, episodes, tally = carry
-        played = play(i)
+        drawn = actions.wide(table[i]) if len(widths) > 1 else actions.samples()
+        order = i * lanes + number
+        played = play_drawn(key, sim, reward, drawn, order, live, record=True)
         e = played.episode
         share = jnp.mean(e.failure, dtype=real)
         near = jnp.sort(jnp.where(e.failure, 0, e.distance))[int(NEAR_SHARE * (lanes - 1))]
@@ -111,7 +100,7 @@ def _calibrated(
             enough |= most > jnp.min(jnp.where(e.failure, jnp.inf, e.distance))
         put = partial(lax.dynamic_update_slice_in_dim, start_index=i * lanes, axis=0)
         episodes = jax.tree.map(put, episodes, e)
-        tally = tally.add(Tally.of(played, live, i * lanes + number))
+        tally = tally.add(Tally.of(played, live, order))
         return i + 1, enough, shares.at[i].set(share), nearest.at[i].set(near), episodes, tally
 
     zero, none = jnp.zeros((), jnp.int32), jnp.zeros((len(widths),), real)
@@ -154,9 +143,9 @@ def with_calibration(
     """
     if calibration is None:
         return found
-    n, e, traced = calibration.tally, calibration.episodes, found.failures is None
+    n, e = calibration.tally, calibration.episodes
     best = _better(_best(sim, reward, e), found.best)
-    if traced:
+    if found.failures is None:  # traced
         later = jnp.where(found.first_failure < 0, -1, found.first_failure + n.episodes)
         first = jnp.where(n.first < NEVER, n.first, later)
     else:
@@ -164,10 +153,10 @@ def with_calibration(
         n = Tally(*(int(v) for v in n[:5]), n.failing)
         later = None if found.first_failure is None else found.first_failure + n.episodes
         first = n.first if n.first < NEVER else later
-    if not traced and n.failures:
-        trees = np.full(len(e.length), -1, np.int32)
-        more = collect(sim, reward, e, trees, seen=n.failures, top=top)
-        found = found._replace(failures=merge(found.failures, more, top=top))
+        if n.failures:
+            trees = np.full(len(e.length), -1, np.int32)
+            more = collect(sim, reward, e, trees, seen=n.failures, top=top)
+            found = found._replace(failures=merge(found.failures, more, top=top))
     episodes, failing = found.episodes + n.episodes, found.failing + n.failures
     return found._replace(
         best=best,
@@ -193,4 +182,4 @@ def _best(sim: Simulator, reward: Any, e: Episode) -> Episode:
 def _better(a: Episode, b: Episode) -> Episode:
     """The one that failed, or else has the higher reward; ``b`` where they are equal."""
     first = (a.failure & ~b.failure) | ((a.failure == b.failure) & (a.reward > b.reward))
-    return jax.tree.map(lambda a, b: jnp.where(first, a, b), a, b)
+    return select(first, a, b)

@@ -32,7 +32,13 @@ from jast._src.runtime.memory import require_episodes
 from jast._src.search.calibration import with_calibration
 from jast._src.search.cem_proposals import copy_steps, latents_around, make_draw, proposal_kinds
 from jast._src.search.driver import Log, finish, finish_traced, require_counts, run
-from jast._src.search.lanes import Tally, blank_episodes, distinct_episodes, play_lanes
+from jast._src.search.lanes import (
+    Tally,
+    blank_episodes,
+    distinct_episodes,
+    play_lanes,
+    take_or_zero,
+)
 from jast._src.search.refine.final import default_share, with_refine_share
 from jast._src.search.result import SearchResult, Trials
 from jast._src.search.setup import default_actions, prepare
@@ -200,22 +206,10 @@ def cem(
         work.require_untraced(name, checkpoint=checkpoint)
         found = search.traced(iterations)
         return with_calibration(sim, reward, calibration, found, top)
-    return run(
-        key,
-        search,
-        ends,
-        settings,
-        trees=trees,
-        record=search.record,
-        calibration=calibration,
-        before=before,
-        progress=progress,
-        callback=callback,
-        checkpoint=checkpoint,
-        reward=reward,
-        actions=actions,
-        around=around,
-    )
+    how = dict(trees=trees, record=search.record, calibration=calibration, before=before)
+    watched = dict(progress=progress, callback=callback, checkpoint=checkpoint)
+    about = dict(reward=reward, actions=actions, around=around)
+    return run(key, search, ends, settings, **how, **watched, **about)
 
 
 @dataclass(frozen=True)
@@ -293,17 +287,10 @@ def _iteration(keys, sim, reward, actions, shares, plan, state, begin):
     tree = jnp.repeat(jnp.arange(trees, dtype=jnp.int32), samples)
     # trees run side by side
     tally = Tally.of(played, live, jnp.tile(number, trees) * trees + tree, tree, trees)
-    latent = tuple(
-        row if kind == "latent" else () for kind, row in zip(plan.kinds, rows, strict=True)
-    )
+    z = tuple(row if kind == "latent" else () for kind, row in zip(plan.kinds, rows, strict=True))
     number = jnp.broadcast_to(number, (trees, samples))
-    new = Elites(
-        episode=by_tree(played.episode),
-        latent=latent,
-        tag=by_tree(played.tag),
-        number=number,
-        count=jnp.ones_like(number),
-    )
+    episode, tag, once = by_tree(played.episode), by_tree(played.tag), jnp.ones_like(number)
+    new = Elites(episode, z, tag, number=number, count=once)
     elites = jax.vmap(_merge)(state.elites, new)
     proposals = jax.vmap(lambda g, e: _fit(g, e, shares, plan))(state.proposals, elites)
     return State(elites, proposals), tally, by_tree(played.trials())
@@ -352,7 +339,7 @@ def _merge(elites, new):
         both.episode.failure, both.episode.reward, both.tag, both.number, both.count, k
     )
     there = places < n
-    best = _take(both, jnp.where(there | (jnp.arange(k) > 0), places, k))
+    best = take_or_zero(both, jnp.where(there | (jnp.arange(k) > 0), places, k))
     reward = jnp.where(there, best.episode.reward, -jnp.inf)
     return best._replace(episode=best.episode._replace(reward=reward), count=counts)
 
@@ -360,31 +347,21 @@ def _merge(elites, new):
 @partial(jax.jit, static_argnums=(1, 2, 3))
 def _first_state(sim, plan, trees, k, width, around=()):
     """No elites and the first proposals, of every tree."""
-    parts = zip(
-        plan.kinds, (signature_of(sim).x0, signature_of(sim).x), (1, sim.horizon), strict=True
-    )
-    proposals = tuple(
-        sequences.standard_normal(like, steps, width)
-        if kind == "latent" and jax.tree.leaves(like)
-        else ()
-        for kind, like, steps in parts
-    )
-    if around:
-        proposals = tuple(
-            g._replace(mean=z) if g != () else () for g, z in zip(proposals, around, strict=True)
-        )
-    z = tuple(
-        jax.tree.map(lambda a: jnp.zeros((k, *a.shape), a.dtype), g.mean) if g != () else ()
-        for g in proposals
-    )
+
+    def first(kind, like, steps, mean):
+        """The proposal of x0 or x, and latents of the elites."""
+        if kind == "copy" or not jax.tree.leaves(like):
+            return (), ()
+        made = sequences.standard_normal(like, steps, width)
+        made = made._replace(mean=mean) if around else made
+        return made, jax.tree.map(lambda a: jnp.zeros((k, *a.shape), a.dtype), made.mean)
+
+    likes = signature_of(sim).x0, signature_of(sim).x
+    parts = zip(plan.kinds, likes, (1, sim.horizon), around or ((), ()), strict=True)
+    proposals, z = zip(*(first(*part) for part in parts), strict=True)
     zero = jnp.zeros((k,), jnp.int32)
-    elites = Elites(
-        episode=blank_episodes(sim, k),
-        latent=z,
-        tag=zero.astype(jnp.uint32),
-        number=zero,
-        count=zero,
-    )
+    tag = zero.astype(jnp.uint32)
+    elites = Elites(blank_episodes(sim, k), z, tag, number=zero, count=zero)
     one = State(elites, proposals)
     return jax.tree.map(lambda a: jnp.broadcast_to(a, (trees, *a.shape)), one)
 
@@ -407,10 +384,6 @@ def _best_failures(elites, top):
     failure, reward = flat.episode.failure, flat.episode.reward
     value = jnp.where(failure, reward, -jnp.inf)
     places, counts = distinct_episodes(failure, value, flat.tag, flat.number, flat.count, top)
-    episode, number = _take((flat.episode, flat.number), places)
+    episode, number = take_or_zero((flat.episode, flat.number), places)
     reward = jnp.where(places < trees * k, episode.reward, -jnp.inf)
     return episode._replace(reward=reward), places // k, number, counts
-
-
-def _take(tree, places):
-    return jax.tree.map(lambda a: a.at[places].get(mode="fill", fill_value=0), tree)

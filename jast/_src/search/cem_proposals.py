@@ -14,6 +14,7 @@ from jast._src.core.signature import signature_of
 from jast._src.core.simulator import Simulator
 from jast._src.normal_space.sequences import disturbance_at
 from jast._src.normal_space.transform import latents
+from jast._src.util.pytrees import select
 
 __all__ = ["latents_around", "copy_steps", "make_draw", "proposal_kinds"]
 
@@ -25,9 +26,8 @@ def proposal_kinds(sim: Simulator, actions: Any) -> tuple[str, str]:
     """How x0 and x are proposed: "latent" where they have a quantile function or a box, else
     "copy".
     """
-    if isinstance(actions, choices.Quantiles | choices.Wide):
-        return "latent" if signature_of(sim).start.quantile else "copy", "latent"
-    if isinstance(actions, choices.UniformBox):  # a start is not of the box
+    if isinstance(actions, choices.Quantiles | choices.Wide | choices.UniformBox):
+        # a start is never of the box
         return "latent" if signature_of(sim).start.quantile else "copy", "latent"
     return "copy", "copy"
 
@@ -58,7 +58,7 @@ def make_draw(kind, actions, anew):
 
     def copied(key, row, dist):
         value, use = row
-        return jax.tree.map(lambda a, b: jnp.where(use, a, b), value, anew(key, dist))
+        return select(use, value, anew(key, dist))
 
     return latent if kind == "latent" else copied
 

@@ -125,15 +125,9 @@ def chain(
     stretch = lanes if runs_on_host(sim) else lanes * max(1, episodes // (lanes * MOMENTS))
     draws = [lanes * (i + 1) for i in range(len(WIDTHS))]
     ends = [*draws, *range(draws[-1] + stretch, episodes, stretch)]
-    return run(
-        key,
-        search,
-        [*(end for end in ends if end < episodes), episodes],
-        settings,
-        progress=progress,
-        callback=callback,
-        checkpoint=checkpoint,
-    )
+    ends = [*(end for end in ends if end < episodes), episodes]
+    watched = dict(progress=progress, callback=callback, checkpoint=checkpoint)
+    return run(key, search, ends, settings, **watched)
 
 
 class _Search:

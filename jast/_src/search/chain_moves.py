@@ -8,14 +8,13 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
 
 from jast import distributions as D
 from jast._src.core.simulator import Simulator
 from jast._src.normal_space.pcn import proposed
 from jast._src.normal_space.transform import dimension, normal_numbers, split_point, used_numbers
 from jast._src.runtime._jax import jit
-from jast._src.search.lanes import Played, Tally, play_lanes
+from jast._src.search.lanes import Played, Tally, in_blocks, play_lanes
 
 __all__ = ["Chains", "Points", "draw_wider", "move_chains", "no_points"]
 
@@ -92,21 +91,15 @@ def move_chains(key, sim, reward, best, chains, widths, begin, end):
     def by_level(tree):
         return jax.tree.map(lambda a: a.reshape(levels, each, *a.shape[1:]), tree)
 
-    def block(carry):
-        at, (best, chains), tally = carry
-        old = chains.points
-        number = at + jnp.arange(lanes, dtype=jnp.int32)
-        live = (number < end) & (number >= begin)
+    def block(number, live, carry):
+        best, chains = carry
+        at, old = number[0], chains.points
         noise = _noise(key, sim, number).reshape(levels, each, d)
         scale, width = chains.scale[:, None, None], widths[:, None, None]
-        z = jnp.where(
-            old.failing[:, :, None],
-            proposed(old.z, noise, scale, width),
-            old.z + scale * width * noise,
-        )
+        moved = proposed(old.z, noise, scale, width), old.z + scale * width * noise
+        z = jnp.where(old.failing[:, :, None], *moved)
         played = play(sim, reward, flat(z), live)
         best = best.merge(played, live, number)
-        tally = tally.add(Tally.of(played, live, number))
         new = by_level(_points(sim, flat(z), played, live))
         nearer = ~old.failing & (new.distance <= old.distance)
         take = by_level(live & ~played.invalid) & (new.failing | nearer)
@@ -118,12 +111,10 @@ def move_chains(key, sim, reward, best, chains, widths, begin, end):
             accepted=MEMORY * chains.accepted + (1 - MEMORY) * share,
         )
         coin = jax.random.fold_in(jax.random.fold_in(key, SWAPS), at)
-        return at + lanes, (best, _exchanged(chains, widths, coin, at // lanes)), tally
+        chains = _exchanged(chains, widths, coin, at // lanes)
+        return (best, chains), Tally.of(played, live, number)
 
-    _, carry, tally = lax.while_loop(
-        lambda c: (c[0] < end) & (c[0] >= begin), block, (begin, (best, chains), Tally.none())
-    )
-    return carry, tally
+    return in_blocks(block, lanes, begin, end, (best, chains))
 
 
 def _exchanged(chains, widths, key, turn):

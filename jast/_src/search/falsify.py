@@ -139,16 +139,10 @@ def falsify(
     check(name, sim)
     given = dict(simulations=simulations, batch=batch, stop=int(stop))
     settings = call_settings(name, key, **given)
-    return run(
-        key,
-        _Search(sim, settings["seed"], batch, top),
-        [*range(batch, simulations, batch), simulations],
-        settings,
-        stop_at_failure=bool(stop),
-        progress=progress,
-        callback=callback,
-        checkpoint=checkpoint,
-    )
+    search = _Search(sim, settings["seed"], batch, top)
+    ends = [*range(batch, simulations, batch), simulations]
+    watched = dict(progress=progress, callback=callback, checkpoint=checkpoint)
+    return run(key, search, ends, settings, stop_at_failure=bool(stop), **watched)
 
 
 class _Search:
@@ -201,12 +195,9 @@ class _Search:
         u = state.failing if len(numbers) else nearest[None]
         normal = map_in_lanes(LANES, _normal, u.astype(normal_numbers(self.sim)))
         e = played(self.sim, normal)
-        failing, nearest = jax.tree.map(lambda a: a[: len(numbers)], e), jax.tree.map(_first, e)
+        failing = jax.tree.map(lambda a: a[: len(numbers)], e)
+        nearest = jax.tree.map(lambda a: a[0], e)
         return finish(self, log, nearest, failing, numbers, counts=once, settings=settings)
-
-
-def _first(a: np.ndarray) -> np.ndarray:
-    return a[0]
 
 
 @jit

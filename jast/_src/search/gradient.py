@@ -92,15 +92,9 @@ def gradient(
         )
     check(name, sim)
     settings = with_refine_share(name, refine, sim, call_settings(name, key, starts=starts), SHARE)
-    return run(
-        key,
-        _Search(key, sim, starts, top),
-        [starts * EVALUATIONS],
-        settings,
-        progress=progress,
-        callback=callback,
-        checkpoint=checkpoint,
-    )
+    search = _Search(key, sim, starts, top)
+    watched = dict(progress=progress, callback=callback, checkpoint=checkpoint)
+    return run(key, search, [starts * EVALUATIONS], settings, **watched)
 
 
 class State(NamedTuple):

@@ -19,6 +19,7 @@ from jast._src.core.transition import advance, begin, conclude
 from jast._src.runtime.host_errors import runs_on_host
 from jast._src.search.result import Trials
 from jast._src.search.tree.packing import pack
+from jast._src.util.pytrees import select, zero_where
 
 __all__ = [
     "EMPTY_HASH",
@@ -28,8 +29,11 @@ __all__ = [
     "blank_episodes",
     "distinct_episodes",
     "fold_hash",
+    "in_blocks",
+    "play_drawn",
     "play_lanes",
     "select_lanes",
+    "take_or_zero",
 ]
 
 
@@ -109,7 +113,7 @@ class Tally(NamedTuple):
         return Tally(*sums, least(self.first, more.first), self.failing | more.failing)
 
 
-def play_lanes(sim, reward, keys, draw_start, draw, live, rows=None, record=False, judge=True):
+def play_lanes(sim, reward, keys, draw_start, draw, live, rows=((), ()), record=False, judge=True):
     """Simulate one episode a lane, all lanes a step at a time: `Played`.
 
     ``keys`` [lanes]: of the episodes. ``draw_start(key, row, dist)`` and ``draw(key, row, dist)``
@@ -121,7 +125,6 @@ def play_lanes(sim, reward, keys, draw_start, draw, live, rows=None, record=Fals
     """
     like = signature_of(sim)
     start = int(like.random_start)
-    rows = ((), ()) if rows is None else rows
     if runs_on_host(sim):  # which runs nothing twice: what is not live does what another lane does
         like_lane = jnp.where(live, jnp.arange(len(live)), jnp.argmax(live))
         keys, rows = keys[like_lane], jax.tree.map(lambda a: a[:, like_lane], rows)
@@ -153,16 +156,10 @@ def play_lanes(sim, reward, keys, draw_start, draw, live, rows=None, record=Fals
         state = select_lanes(on, after.state, before.state) if sim.episodic else after.state
         after = select_lanes(on, after._replace(state=()), before._replace(state=()))
         if record:
-            xs = jax.tree.map(
-                lambda a, b: a.at[t].set(jax.vmap(jnp.where)(on, b, jnp.zeros_like(b))), xs, x
-            )
-        return (
-            t + 1,
-            length + on.astype(jnp.int32),
-            jnp.where(on, folded, tag),
-            xs,
-            after._replace(state=state),
-        )
+            x = jax.vmap(zero_where)(~on, x)
+            xs = jax.tree.map(lambda a, b: a.at[t].set(b), xs, x)
+        length, tag = length + on.astype(jnp.int32), jnp.where(on, folded, tag)
+        return t + 1, length, tag, xs, after._replace(state=state)
 
     zero, begun = jnp.zeros(live.shape, jnp.int32), progress._replace(done=progress.done | ~live)
     carry = jnp.int32(0), zero, tag, xs, begun
@@ -177,9 +174,45 @@ def play_lanes(sim, reward, keys, draw_start, draw, live, rows=None, record=Fals
     return Played(e, ~finite, tag)
 
 
+def play_drawn(key, sim, reward, actions, number, live, **how):
+    """`play_lanes` of the episodes of these numbers [lanes] of the tree's ``key``, as ``actions``
+    draw them.
+    """
+
+    def draw_start(key, row, dist):
+        return actions.draw_start(key, dist)
+
+    def draw(key, row, dist):
+        return actions.draw(key, dist)
+
+    keys = jax.vmap(jax.random.fold_in, (None, 0))(key, number)
+    return play_lanes(sim, reward, keys, draw_start, draw, live, **how)
+
+
+def in_blocks(block, lanes, begin, end, carry):
+    """``(carry, Tally)`` after ``block(number, live, carry)``, which returns such a pair, of each
+    block of lanes of the episodes ``begin`` .. ``end - 1``: their numbers [lanes], and which of
+    them are live.
+    """
+    begin, end = jnp.asarray(begin, jnp.int32), jnp.asarray(end, jnp.int32)
+
+    # compared by what is left, as the end may be the last int32
+    def left(number):
+        return (number < end) & (number >= begin)
+
+    def body(carried):
+        at, carry, tally = carried
+        number = at + jnp.arange(lanes, dtype=jnp.int32)
+        carry, more = block(number, left(number), carry)
+        return at + lanes, carry, tally.add(more)
+
+    _, carry, tally = lax.while_loop(lambda c: left(c[0]), body, (begin, carry, Tally.none()))
+    return carry, tally
+
+
 def select_lanes(pred, a, b):
     """Leaves [lanes, ...] of ``a`` where ``pred`` [lanes], else of ``b``."""
-    return jax.tree.map(lambda a, b: jax.vmap(jnp.where)(pred, a, b), a, b)
+    return jax.vmap(select)(pred, a, b)
 
 
 @partial(jax.jit, static_argnums=1)
@@ -212,6 +245,11 @@ def distinct_episodes(failure, reward, tag, number, count, k):
     to = jnp.where(group < 2, jnp.cumsum(new, dtype=jnp.int32) - 1, k)
     places = jnp.full((k,), n, jnp.int32).at[jnp.where(new, to, k)].set(place, mode="drop")
     return places, jnp.zeros((k,), jnp.int32).at[to].add(count, mode="drop")
+
+
+def take_or_zero(tree, places):
+    """The rows ``places`` [k] of the leaves [n, ...]; zeros where a place is n or more."""
+    return jax.tree.map(lambda a: a.at[places].get(mode="fill", fill_value=0), tree)
 
 
 def fold_hash(tag, x):

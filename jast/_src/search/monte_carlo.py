@@ -35,11 +35,11 @@ from jast._src.search.driver import (
     progress_words,
     require_counts,
 )
-from jast._src.search.lanes import Tally, distinct_episodes, play_lanes
+from jast._src.search.lanes import Tally, distinct_episodes, in_blocks, play_drawn, take_or_zero
 from jast._src.search.refine.final import default_share, with_refine_share
 from jast._src.search.result import SearchResult, Trials
 from jast._src.search.setup import prepare
-from jast._src.util.pytrees import map_in_lanes
+from jast._src.util.pytrees import map_in_lanes, select
 
 __all__ = ["monte_carlo"]
 
@@ -162,10 +162,10 @@ def monte_carlo(
         records = f"the records of {episodes} episodes"
         require(name, 2 * episodes * row, records, "use fewer, or record=False")
 
-    most = (2**31 - 1) // (lanes * sim.horizon)  # the steps of a chunk are counted in int32
-    blocks = (
-        1 if record or runs_on_host(sim) else max(1, min(-(-episodes // (lanes * MOMENTS)), most))
-    )
+    blocks = 1
+    if not record and not runs_on_host(sim):
+        most = (2**31 - 1) // (lanes * sim.horizon)  # the steps of a chunk are counted in int32
+        blocks = max(1, min(-(-episodes // (lanes * MOMENTS)), most))
     job = Job(
         *parts,
         top=top,
@@ -255,18 +255,14 @@ def _merged(found, new):
     better = (new.failure & ~found.failure) | (
         (new.failure == found.failure) & (new.reward > found.reward)
     )
-    best = jax.tree.map(lambda a, b: jnp.where(better, b, a), found[:3], new[:3])
+    best = select(better, new[:3], found[:3])
 
     def merge(top):
         both = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), top, new.top)
         everywhere = jnp.ones(both.reward.shape, bool)
         places, counts = distinct_episodes(everywhere, *both, len(top.reward))
-        return Top(
-            reward=both.reward.at[places].get(mode="fill", fill_value=-jnp.inf),
-            tag=both.tag.at[places].get(mode="fill", fill_value=0),
-            number=both.number.at[places].get(mode="fill", fill_value=0),
-            count=counts,
-        )
+        reward = both.reward.at[places].get(mode="fill", fill_value=-jnp.inf)
+        return take_or_zero(both, places)._replace(reward=reward, count=counts)
 
     # rarely anything enters, and sorting is dear; a repetition of the least one is to be counted,
     # too
@@ -285,17 +281,10 @@ def _nothing(sim, top):
 def _chunk(key, sim, reward, actions, found, begin, end, lanes):
     """Episodes ``begin`` .. ``end - 1``, a block of lanes at a time: (`Found`, `Tally`)."""
 
-    def block(carry):
-        at, found, tally = carry
-        found, more, _ = _block(key, sim, reward, actions, found, at, end, lanes)
-        return at + lanes, found, tally.add(more)
+    def block(number, live, found):
+        return _summed(found, number, live, play_drawn(key, sim, reward, actions, number, live))
 
-    begin, end = jnp.asarray(begin, jnp.int32), jnp.asarray(end, jnp.int32)
-    # compared by what is left, as the end may be the last int32
-    _, found, tally = lax.while_loop(
-        lambda c: (c[0] < end) & (c[0] >= begin), block, (begin, found, Tally.none())
-    )
-    return found, tally
+    return in_blocks(block, lanes, begin, end, found)
 
 
 @partial(jit, static_argnames="lanes")
@@ -305,7 +294,7 @@ def _block(key, sim, reward, actions, found, begin, end, lanes):
     """
     number = begin + jnp.arange(lanes, dtype=jnp.int32)
     live = (number < end) & (number >= begin)
-    played = _play(key, sim, reward, actions, number, live)
+    played = play_drawn(key, sim, reward, actions, number, live)
     return *_summed(found, number, live, played), played
 
 
@@ -322,22 +311,10 @@ def _summed(found, number, live, played):
     return found, Tally.of(played, live, number)
 
 
-def _play(key, sim, reward, actions, number, live, **how):
-    keys = jax.vmap(jax.random.fold_in, (None, 0))(key, number)
-
-    def draw_start(key, row, dist):
-        return actions.draw_start(key, dist)
-
-    def draw(key, row, dist):
-        return actions.draw(key, dist)
-
-    return play_lanes(sim, reward, keys, draw_start, draw, live, **how)
-
-
 @jit
 def _recorded(key, sim, reward, actions, number, live):
     """`Played` with their disturbances."""
-    return _play(key, sim, reward, actions, number, live, record=True)
+    return play_drawn(key, sim, reward, actions, number, live, record=True)
 
 
 def _rebuilt(parts, numbers):
@@ -356,4 +333,4 @@ def _rebuild(key, sim, reward, actions, number):
     """The episodes of these numbers [m], with their disturbances."""
     live = jnp.ones(number.shape, bool)
     parts = key, sim, reward, actions, number, live
-    return _play(*parts, record=True, judge=False).episode
+    return play_drawn(*parts, record=True, judge=False).episode

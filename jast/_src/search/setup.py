@@ -83,14 +83,13 @@ def _scaled(
     given = getattr(reward, "density", None) if bare else "raw"
     density = given or signature.density
     calibration = calibrate(sim, density, widen)
-    told = calibration.near, calibration.rare, calibration.likely, calibration.width
-    if not is_traced(told):
-        if given is None and 2 * int(calibration.tally.invalid) > int(calibration.tally.episodes):
-            # a mode of infinite density, as a family of the user's own may have
-            density, calibration = "raw", calibrate(sim, "raw", widen)
-            told = calibration.near, calibration.rare, calibration.likely, calibration.width
-        told = [float(v) for v in jax.device_get(told)]
-    near, rare, likely, width = told
+    tally, traced = calibration.tally, is_traced(calibration[:4])
+    if not traced and given is None and 2 * int(tally.invalid) > int(tally.episodes):
+        # a mode of infinite density, as a family of the user's own may have
+        density, calibration = "raw", calibrate(sim, "raw", widen)
+    near, rare, likely, width, *_ = calibration
+    if not traced:
+        near, rare, likely, width = (float(v) for v in (near, rare, likely, width))
     if bare:
         reward = replace(
             reward,

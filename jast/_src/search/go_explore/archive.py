@@ -13,7 +13,6 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
 
 from jast._src.core.rewards import log_likelihood
 from jast._src.core.signature import signature_of
@@ -114,48 +113,39 @@ def merge_cells(
     """
     slots = cells.live.shape[0]
     real = cells.near.dtype
-    if sim.episodic:
-        near = jnp.full(good.shape, jnp.inf, real)
-    else:
-        near = jax.vmap(lambda s: jnp.asarray(sim.evaluate(s)[1]).astype(real))(
-            points.progress.state
-        )
+    state = points.progress.state
+    near = jnp.full(good.shape, jnp.inf, real)
+    if not sim.episodic:
+        near = jax.vmap(lambda s: jnp.asarray(sim.evaluate(s)[1]).astype(real))(state)
 
     def both(a, b):
         return jnp.concatenate([a, b])
 
     value = both(cells.points.progress.reward, points.progress.reward)
     live = both(cells.live, good) & jnp.isfinite(value)
-    parts = cells.points.progress.state, points.progress.state
+    parts = cells.points.progress.state, state
     if cell is None:
         told = both(*(jax.vmap(partial(features, sim))(s) for s in parts))
         t = both(cells.points.t, points.t)
         name = _by_default(sim, key, told, t, both(cells.near, near), live, cells)
     else:
-        name = both(
-            *(jax.vmap(lambda s: fold_hash(jnp.uint32(EMPTY_HASH), cell(s)))(s) for s in parts)
-        )
+        of_user = jax.vmap(lambda s: fold_hash(jnp.uint32(EMPTY_HASH), cell(s)))
+        name = both(*map(of_user, parts))
     # the likeliest way to each cell
-    out = jnp.where(live, 0, 1)
-    index = jnp.arange(live.shape[0], dtype=jnp.int32)
-    out, name, _, order = lax.sort((out, name, -value, index), num_keys=4)
-    first = (out == 0) & jnp.concatenate(
-        [jnp.ones(1, bool), (name[1:] != name[:-1]) | (out[1:] != out[:-1])]
-    )
+    order = jnp.lexsort((-value, name, ~live))
+    name, there = name[order], live[order]
+    differs = (name[1:] != name[:-1]) | (there[1:] != there[:-1])
+    first = there & both(jnp.ones(1, bool), differs)
     group = jnp.cumsum(first, dtype=jnp.int32) - 1
     seen = both(cells.seen, jnp.zeros_like(points.t))[order]
-    seen = jnp.zeros_like(seen).at[group].max(jnp.where(out == 0, seen, 0))[group]
+    seen = jnp.zeros_like(seen).at[group].max(jnp.where(there, seen, 0))[group]
     wins = jnp.zeros_like(first).at[order].set(first)
     seen = jnp.zeros_like(seen).at[order].set(seen)
 
     # the nearest of the new ones take the slots of those that lost, then of the most seen
     old, new = wins[:slots], wins[slots:]
-    index = jnp.arange(new.shape[0], dtype=jnp.int32)
-    _, _, places = lax.sort((jnp.where(new, 0, 1), near, index), num_keys=2)
-    index = jnp.arange(slots, dtype=jnp.int32)
-    _, _, free = lax.sort((jnp.where(old, 1, 0), -seen[:slots], index), num_keys=2)
-    most = min(most, slots, len(places))
-    places, free = places[:most], free[:most]
+    most = min(most, slots, len(new))
+    places, free = jnp.lexsort((near, ~new))[:most], jnp.lexsort((-seen[:slots], old))[:most]
     enters = new[places] & (~old[free] | (seen[:slots][free] > 0))
     to = jnp.where(enters, free, slots)
 

@@ -21,6 +21,7 @@ from jast._src.core.simulator import Simulator
 from jast._src.core.transition import Progress, advance, begin, conclude
 from jast._src.distributions.flat_rows import unflat
 from jast._src.search.lanes import EMPTY_HASH, Played, fold_hash
+from jast._src.util.pytrees import count_numbers, select
 
 __all__ = [
     "CHANGES",
@@ -115,12 +116,8 @@ def continue_runs(
 
     def move(key, p, own, on):
         x = draw(key, p.t, own, sim.disturbance(p.progress.state))
-        new = Point(
-            advance(sim, reward, p.progress, x, p.t + 1 >= sim.horizon),
-            p.t + 1,
-            fold_hash(p.tag, x),
-        )
-        return x, jax.tree.map(lambda a, b: jnp.where(on, a, b), new, p)
+        progress = advance(sim, reward, p.progress, x, p.t + 1 >= sim.horizon)
+        return x, select(on, Point(progress, p.t + 1, fold_hash(p.tag, x)), p)
 
     def step(carry):
         i, p, new, xs, way = carry
@@ -136,9 +133,8 @@ def continue_runs(
 
 def start_point(sim: Simulator, reward: Any, x0: Any) -> Point:
     """The `Point` that x0 leads to, before any step."""
-    return Point(
-        begin(sim, reward, x0), jnp.zeros((), jnp.int32), fold_hash(jnp.uint32(EMPTY_HASH), x0)
-    )
+    tag = fold_hash(jnp.uint32(EMPTY_HASH), x0)
+    return Point(begin(sim, reward, x0), jnp.zeros((), jnp.int32), tag)
 
 
 def played_runs(
@@ -193,8 +189,7 @@ def _fresh(key, t, own, dist):
 
 
 def _normal(key, dist, dtype):
-    numbers = sum(int(np.prod(s.shape)) for s in jax.tree.leaves(D.event_like(dist)))
-    return jax.random.normal(key, (numbers,), dtype)
+    return jax.random.normal(key, (count_numbers(D.event_like(dist)),), dtype)
 
 
 def following_draws(sim: Simulator) -> tuple[Callable, Callable]:
@@ -209,7 +204,7 @@ def following_draws(sim: Simulator) -> tuple[Callable, Callable]:
         x = jax.tree.map(lambda a: a[jnp.minimum(t, a.shape[0] - 1)], own.rows)
         anew = fresh(key, t, own.noise, dist)
         changed = step(jax.random.fold_in(key, t + 1), own, x, anew, dist)
-        return jax.tree.map(lambda a, b: jnp.where(t < own.length, a, b), changed, anew)
+        return select(t < own.length, changed, anew)
 
     def draw_start(key, own, dist):
         anew = fresh_start(key, own.noise, dist)
@@ -236,14 +231,15 @@ def _changer(has_mode: bool, aside: bool) -> Callable:
             z = D.to_normal(dist, x)
             e = unflat(_normal(noise, dist, dtype), D.event_like(dist))
             keep = jnp.sqrt(1 - own.size**2)
-            mixed = jax.tree.map(
-                lambda z, e: keep.astype(z.dtype) * z + own.size.astype(z.dtype) * e, z, e
-            )
-            ways[3] = D.from_normal(dist, mixed)
+
+            def mixed(z, e):
+                return keep.astype(z.dtype) * z + own.size.astype(z.dtype) * e
+
+            ways[3] = D.from_normal(dist, jax.tree.map(mixed, z, e))
         changed = jax.tree.map(
             lambda *each: jnp.stack([a.astype(each[0].dtype) for a in each])[own.change], *ways
         )
         hit = jax.random.uniform(coin, (), dtype) < own.rate
-        return jax.tree.map(lambda a, b: jnp.where(hit, a, b), changed, x)
+        return select(hit, changed, x)
 
     return change

@@ -147,26 +147,20 @@ def go_explore(
     needed = 2 * memory.size(jax.eval_shape(partial(empty_cells, sim, slots)))
     memory.require(name, needed, f"{slots} states and the ways there", "use a smaller state")
     stretch = lanes if runs_on_host(sim) else lanes * max(1, episodes // (lanes * MOMENTS))
-    return run(
-        key,
-        _Search(
-            sim=sim,
-            reward=standard_reward(sim),
-            top=top,
-            key=tree_keys(key, 1)[0],
-            cell=None if cell is None else _cell(name, sim, cell),
-            plan=Plan(lanes, length, min(TRACES, lanes // 8)),
-            slots=slots,
-            episodes=episodes,
-            until=int(episodes * (1 - backward)),
-        ),
-        [*range(stretch, episodes, stretch), episodes],
-        settings,
-        progress=progress,
-        callback=callback,
-        checkpoint=checkpoint,
-        cell=cell,
+    search = _Search(
+        sim=sim,
+        reward=standard_reward(sim),
+        top=top,
+        key=tree_keys(key, 1)[0],
+        cell=None if cell is None else _cell(name, sim, cell),
+        plan=Plan(lanes, length, min(TRACES, lanes // 8)),
+        slots=slots,
+        episodes=episodes,
+        until=int(episodes * (1 - backward)),
     )
+    ends = [*range(stretch, episodes, stretch), episodes]
+    watched = dict(progress=progress, callback=callback, checkpoint=checkpoint)
+    return run(key, search, ends, settings, **watched, cell=cell)
 
 
 def _cell(name, sim, cell):

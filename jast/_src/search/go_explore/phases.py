@@ -8,7 +8,6 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
 
 from jast._src.core.signature import signature_of
 from jast._src.runtime._jax import jit
@@ -23,7 +22,8 @@ from jast._src.search.go_explore.continued_runs import (
     played_runs,
     start_point,
 )
-from jast._src.search.lanes import Tally, select_lanes
+from jast._src.search.lanes import Tally, in_blocks, select_lanes
+from jast._src.util.pytrees import select
 
 __all__ = ["Plan", "Traces", "improve_backward", "explore"]
 
@@ -68,44 +68,35 @@ def explore(key, sim, reward, cell, plan, cells, best, begin, end):
     length = plan.length
     way = np.unique(np.linspace(0, length - 1, POINTS).round().astype(np.int32))
 
-    def block(at, carry):
-        (cells, best), tally = carry
-        number, live, keys = _lanes(key, plan, at, begin, end)
-        noise, coins = _noise(sim, keys)
+    def block(number, live, carry):
+        cells, best = carry
+        keys, coins = _keys_and_coins(sim, key, number)
+        noise = _noise(coins)
         slot = choose_cells(cells, coins[:, 0], coins[:, 1], NEAREST)
         anew = (coins[:, 2] < FROM_START) | ~jnp.any(cells.live)
         x0 = jax.vmap(lambda k, own: draw_start(k, own, sim.start()))(keys, noise)
         first = jax.vmap(partial(start_point, sim, reward), axis_size=plan.lanes)(x0)
-        points = select_lanes(anew, first, jax.tree.map(lambda a: a[slot], cells.points))
-        x0 = select_lanes(anew, x0, jax.tree.map(lambda a: a[slot], cells.x0))
-        rows = jax.tree.map(lambda a: a[slot], cells.rows)
+        kept = jax.tree.map(lambda a: a[slot], cells)
+        points, x0 = select_lanes(anew, (first, x0), (kept.points, kept.x0))
         until = jnp.where(live, points.t + length, 0)
         ends, new, xs, points_on = continue_runs(
             sim, reward, keys, points, until, draw, noise, length, keep=True
         )
-        played = played_runs(sim, reward, x0, rows, points, ends, new, xs)
+        played = played_runs(sim, reward, x0, kept.rows, points, ends, new, xs)
         mark = jax.vmap(partial(features, sim))(ends.progress.state)
         best = best.merge(played, live, number, mark)
-        tally = tally.add(_tally(played, new, live, number))
 
         seen = cells.seen.at[jnp.where(live & ~anew, slot, len(cells.seen))].add(1, mode="drop")
         good = (way[:, None] < new[None]) & ~points_on.progress.done[way] & live[None]
-        flat = partial(_rows_of, way)
+        # the points on the way [m, N] in a row, and the lane of each
+        rows = jax.tree.map(lambda a: a[way].reshape(good.size, *a.shape[2:]), points_on)
         lane = jnp.tile(jnp.arange(plan.lanes, dtype=jnp.int32), len(way))
-        cells = merge_cells(
-            sim,
-            cell,
-            key,
-            cells._replace(seen=seen),
-            jax.tree.map(flat, points_on),
-            good.reshape(-1),
-            lane,
-            (x0, played.episode.disturbances),
-            4 * plan.lanes,
-        )
-        return (cells, best), tally
+        new_ones = rows, good.reshape(-1), lane, (x0, played.episode.disturbances)
+        cells = cells._replace(seen=seen)
+        cells = merge_cells(sim, cell, key, cells, *new_ones, 4 * plan.lanes)
+        return (cells, best), _tally(played, new, live, number)
 
-    return _blocks(block, plan, begin, end, (cells, best))
+    return in_blocks(block, plan.lanes, begin, end, (cells, best))
 
 
 @partial(jit, static_argnames="plan")
@@ -117,10 +108,10 @@ def improve_backward(key, sim, reward, plan, best, traces, begin, end, since, wh
     p, n = plan.traces, plan.lanes
     own_of = jnp.arange(n, dtype=jnp.int32) % p
 
-    def block(at, carry):
-        (best, traces), tally = carry
-        number, live, keys = _lanes(key, plan, at, begin, end)
-        share = (at.astype(whole.dtype) - since) / whole
+    def block(number, live, carry):
+        best, traces = carry
+        keys, coins = _keys_and_coins(sim, key, number)
+        share = (number[0].astype(whole.dtype) - since) / whole
         left = jnp.maximum(1 - share, 0) * traces.length.astype(whole.dtype)
         back = jnp.minimum(left.astype(jnp.int32), traces.length - 1)
         first = jax.vmap(partial(start_point, sim, reward), axis_size=p)(traces.x0)
@@ -128,84 +119,55 @@ def improve_backward(key, sim, reward, plan, best, traces, begin, end, since, wh
         points, steps, _, _ = continue_runs(
             sim, reward, keys[:p], first, until, _copied, traces.rows, sim.horizon
         )
-        mine = jax.tree.map(lambda a: a[own_of], (traces, points, back))
-        own = _ways(sim, keys, mine[0], mine[2])
-        points, x0 = mine[1], mine[0].x0
+        mine, points, back = jax.tree.map(lambda a: a[own_of], (traces, points, back))
+        own, x0 = _ways(coins, mine, back), mine.x0
         if signature_of(sim).random_start:
             moved = jax.vmap(lambda k, own: draw_start(k, own, sim.start()))(keys, own)
-            whole_way = jnp.broadcast_to(share >= 1, (n,))
-            x0 = select_lanes(whole_way, moved, x0)
-            points = select_lanes(
-                whole_way,
-                jax.vmap(partial(start_point, sim, reward), axis_size=plan.lanes)(x0),
-                points,
-            )
+            x0 = select(share >= 1, moved, x0)
+            first = jax.vmap(partial(start_point, sim, reward), axis_size=n)(x0)
+            points = select(share >= 1, first, points)
         until = jnp.where(live, sim.horizon, 0)
         ends, new, xs, _ = continue_runs(sim, reward, keys, points, until, draw, own, sim.horizon)
-        played = played_runs(sim, reward, x0, mine[0].rows, points, ends, new, xs)
+        played = played_runs(sim, reward, x0, mine.rows, points, ends, new, xs)
         mark = jax.vmap(partial(features, sim))(ends.progress.state)
         best = best.merge(played, live, number, mark)
         more = _tally(played, new, live, number)
         more = more._replace(steps=more.steps + jnp.sum(steps, dtype=jnp.int32))
-        tally = tally.add(more)
-        return (best, _bettered(traces, played, live)), tally
+        return (best, _bettered(traces, played, live)), more
 
-    return _blocks(block, plan, begin, end, (best, traces))
-
-
-def _rows_of(way, a):
-    """The rows ``way`` [m] of ``a`` [T, N, ...], one after another: [m N, ...]."""
-    return a[way].reshape(len(way) * a.shape[1], *a.shape[2:])
+    return in_blocks(block, plan.lanes, begin, end, (best, traces))
 
 
 def _copied(key, t, rows, dist):
     return jax.tree.map(lambda a: a[t], rows)
 
 
-def _blocks(block, plan, begin, end, carry):
-    """``carry, tally`` after ``block(at, (carry, tally))`` for each block of lanes."""
-    _, carry, tally = lax.while_loop(
-        lambda c: (c[0] < end) & (c[0] >= begin),
-        lambda c: (c[0] + plan.lanes, *block(c[0], c[1:])),
-        (begin, carry, Tally.none()),
-    )
-    return carry, tally
+def _keys_and_coins(sim, key, number):
+    """The keys of the runs of these numbers, and five uniform numbers of each."""
+    keys, real = jax.vmap(jax.random.fold_in, (None, 0))(key, number), signature_of(sim).dtype
+    coins = jax.vmap(lambda k: jax.random.uniform(jax.random.fold_in(k, COINS), (5,), real))
+    return keys, coins(keys)
 
 
-def _lanes(key, plan, at, begin, end):
-    """The numbers of the runs from ``at`` on, which of them are live, and their keys."""
-    number = at + jnp.arange(plan.lanes, dtype=jnp.int32)
-    live = (number < end) & (number >= begin)
-    return number, live, jax.vmap(jax.random.fold_in, (None, 0))(key, number)
-
-
-def _noise(sim, keys):
-    """How each run draws, and three more uniform numbers of it."""
-    real = signature_of(sim).dtype
-    u = jax.vmap(lambda k: jax.random.uniform(jax.random.fold_in(k, COINS), (5,), real))(keys)
+def _noise(u):
+    """How each run draws, by two of its uniform numbers ``u`` [N, 5]."""
+    real = u.dtype
     widths, shares = jnp.asarray(WIDTHS, real), jnp.asarray(PERSISTING, real)
     width = widths[(u[:, 3] * len(WIDTHS)).astype(jnp.int32)]
-    return Noise(width, shares[(u[:, 4] * len(PERSISTING)).astype(jnp.int32)]), u[:, :3]
+    return Noise(width, shares[(u[:, 4] * len(PERSISTING)).astype(jnp.int32)])
 
 
-def _ways(sim, keys, traces, back):
-    """How each run follows its trace from step ``back`` on: a `Follow`."""
-    real = signature_of(sim).dtype
-    u = jax.vmap(lambda k: jax.random.uniform(jax.random.fold_in(k, COINS), (5,), real))(keys)
-    steps = jnp.maximum(traces.length - back, 1).astype(real)
-    rate = jnp.where(u[:, 0] < 0.3, 1.0, steps ** -u[:, 1]).astype(real)
+def _ways(u, traces, back):
+    """How each run follows its trace from step ``back`` on, by its uniform numbers ``u`` [N, 5]: a
+    `Follow`.
+    """
+    steps = jnp.maximum(traces.length - back, 1).astype(u.dtype)
+    rate = jnp.where(u[:, 0] < 0.3, 1.0, steps ** -u[:, 1]).astype(u.dtype)
     change = (u[:, 2] * len(CHANGES)).astype(jnp.int32)
     size = 10 ** (-3 * u[:, 3])
     noise = Noise(0.5 + u[:, 4], jnp.zeros_like(size))
-    return Follow(
-        noise=noise,
-        rows=traces.rows,
-        x0=traces.x0,
-        length=traces.length,
-        rate=rate,
-        change=change,
-        size=size,
-    )
+    of_trace = dict(rows=traces.rows, x0=traces.x0, length=traces.length)
+    return Follow(noise=noise, **of_trace, rate=rate, change=change, size=size)
 
 
 def _bettered(traces, played, live):
