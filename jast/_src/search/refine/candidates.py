@@ -25,20 +25,16 @@ from typing import NamedTuple
 import numpy as np
 
 __all__ = [
-    "ENTRANTS",
-    "EXCHANGES",
     "NEAREST",
     "RAYS",
-    "REMOVALS",
-    "SHIFTS",
     "SIZE",
-    "WALKS",
     "Noise",
     "Point",
     "boundary_direction",
     "candidates",
     "draw_noise",
     "resize_steps",
+    "shift_in_time",
 ]
 
 RAY_LENGTHS = 8, 4, 2, 1, 0.5, 0.25
@@ -317,14 +313,16 @@ def _picked(among, uniform, worth):
 
 def _shifted(v, steps, fill, first, horizon):
     """``v`` moved in time, at equal distance from the origin or a little nearer."""
-    moved = _in_time(v, steps, fill, first, horizon)
+    moved = shift_in_time(v, steps, fill, first, horizon)
     radius = _norm(v)[:, None] * (1 - 1e-5)
     return moved * (radius / np.maximum(_norm(moved), NEAREST)).astype(v.dtype)
 
 
-def _in_time(v, steps, fill, first, horizon):
-    """``v`` [n, D] with its disturbances that many ``steps`` [n, k] later, sooner where negative.
-    What comes in is the first of them times ``fill`` [n, k], at the end modes.
+def shift_in_time(
+    v: np.ndarray, steps: np.ndarray, fill: np.ndarray, first: int, horizon: int
+) -> np.ndarray:
+    """``v`` [n, D] with its disturbances that many ``steps`` [n, k] later, sooner where negative:
+    [n, k, D]. What comes in is the first of them times ``fill`` [n, k], at the end modes.
     """
     n, d = v.shape
     rows = v[:, first:].reshape(n, horizon, -1)

@@ -8,6 +8,7 @@ from jast._src.core.signature import signature_of
 from jast._src.core.simulator import Simulator
 from jast._src.normal_space.evaluate_points import PointEvaluator
 from jast._src.normal_space.transform import unit
+from jast._src.search.refine.candidates import shift_in_time
 from jast._src.util.pytrees import count_numbers
 
 __all__ = [
@@ -279,12 +280,8 @@ def moved_in_time(sim: Simulator, v: np.ndarray, steps: np.ndarray) -> np.ndarra
     """The points ``v`` [n, D] with their disturbances so many ``steps`` [n] later, sooner where
     negative; what comes in is the mode. On the host.
     """
-    first, n = count_numbers(signature_of(sim).x0), len(v)
-    rows, t = v[:, first:].reshape(n, sim.horizon, -1), np.arange(sim.horizon) - steps[:, None]
-    inside = (t >= 0) & (t < sim.horizon)
-    moved = np.take_along_axis(rows, np.clip(t, 0, sim.horizon - 1)[..., None], axis=1)
-    moved = np.where(inside[..., None], moved, 0)
-    return np.concatenate([v[:, :first], moved.reshape(n, -1)], axis=1)
+    first, steps = count_numbers(signature_of(sim).x0), steps[:, None]
+    return shift_in_time(v, steps, np.zeros(steps.shape), first, sim.horizon)[:, 0]
 
 
 def _across(a, b):

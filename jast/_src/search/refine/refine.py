@@ -341,16 +341,8 @@ class _Refinement:
             which = np.array(list(failing))
             found = collect(self.sim, reward, episodes, simulation=which, top=len(which))
             i = found.simulation
-        return Refined(
-            failures=found,
-            origin=origin[i],
-            residual=residual[i],
-            gain=gain[i],
-            late=late[i],
-            episodes=self.spent,
-            invalid=self.invalid,
-            settings=settings,
-        )
+        told = (a[i] for a in (origin, residual, gain, late))
+        return Refined(found, *told, self.spent, self.invalid, settings)
 
 
 def _stacked(tracks):
