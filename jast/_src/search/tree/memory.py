@@ -53,9 +53,8 @@ def fit(
         lanes = -(-trees // (threads * rounds)) if host else trees
     lanes = min(lanes, trees, most_lanes(pages_of(problem, plan.prunes * plan.simulations)))
     threads = min(threads, -(-trees // lanes))
-    for memoize in (
-        ["node", "root"] if auto and not (plan.edges or plan.branches) else [plan.memoize]
-    ):
+    either = auto and not (plan.edges or plan.branches)
+    for memoize in ["node", "root"] if either else [plan.memoize]:
         plan = plan._replace(memoize=memoize)
         one = bytes_per_tree(problem, plan)
         within = lanes if free is None else int(0.8 * free // (one * threads))

@@ -27,10 +27,8 @@ def result(search: Any, batches: list[TreeBatch], settings: dict, training: Any)
     """The `SearchResult` of ``batches`` of a search (its ``sim``, ``reward`` and ``top``);
     ``training``: what the heads learned, or None.
     """
-    log, outcome = (
-        np.concatenate([getattr(batch, field) for batch in batches], axis=1)
-        for field in ("log", "outcome")
-    )
+    log = np.concatenate([batch.log for batch in batches], axis=1)
+    outcome = np.concatenate([batch.outcome for batch in batches], axis=1)
     ran, failed, fresh = ((outcome & bit) > 0 for bit in (RAN, FAILURE, FRESH))
     value = np.where(ran, log, -np.inf)
     first = failed.reshape(-1).argmax()
@@ -48,9 +46,8 @@ def result(search: Any, batches: list[TreeBatch], settings: dict, training: Any)
         interrupted=None,
         trials=_trials(batches, value, failed, fresh),
     )
-    found = jax.tree.map(lambda *parts: np.concatenate(parts), *(b.found for b in batches))
-    tree, simulation = (
-        np.concatenate([getattr(b, field) for b in batches]) for field in ("tree", "simulation")
+    found, tree, simulation = jax.tree.map(
+        lambda *parts: np.concatenate(parts), *((b.found, b.tree, b.simulation) for b in batches)
     )
     nearest = _take(found, np.argmax(np.where(found.failure, -np.inf, found.reward)))
     rows = _distinct(found, tree, simulation, search.top)
@@ -84,14 +81,8 @@ def _trials(batches: list[TreeBatch], value, failed, fresh) -> Trials | None:
     if isinstance(batches[0].trials, tuple):
         return None
     distance, log_prob = np.moveaxis(np.concatenate([h.trials for h in batches], axis=2), 1, 0)
-    return Trials(
-        value,
-        np.where(fresh & np.isfinite(value), distance, np.inf),
-        log_prob,
-        failed & fresh,
-        fresh,
-        failed & ~fresh,
-    )
+    distance = np.where(fresh & np.isfinite(value), distance, np.inf)
+    return Trials(value, distance, log_prob, failed & fresh, fresh, failed & ~fresh)
 
 
 def _distinct(found: Episode, tree, simulation, top: int) -> np.ndarray:

@@ -47,6 +47,11 @@ class Plan(NamedTuple):
     recount: bool = False
     """Whether the statistics of roots are those at the end of the tree, not of their turn."""
 
+    @property
+    def room(self) -> tuple[int, str, int | None, bool]:
+        """What `search.tree.layout.make` is told of it, the simulations of a tree first."""
+        return self.prunes * self.simulations, self.memoize, self.pages, self.record
+
 
 class TreeBatch(NamedTuple):
     """What is kept of a group of trees: B trees of S simulations."""
@@ -85,10 +90,8 @@ _rebuild = jit(rebuild, static_argnames=("memoize",))
 
 def bytes_per_tree(problem, plan):
     """Bytes that one tree takes while it grows, from the shapes of its arrays."""
-    simulations = plan.prunes * plan.simulations
     keys = tree_keys(jax.random.key(0), 2)
-    room = simulations, plan.memoize, plan.pages, plan.record
-    return size(_make.eval_shape(problem, keys, *room)) // 2
+    return size(_make.eval_shape(problem, keys, *plan.room)) // 2
 
 
 class Round(NamedTuple):
@@ -132,8 +135,7 @@ def _like(turn: Round) -> TreeBatch:
     """The shapes of what `_one_group` returns."""
     problem, _, plan = turn[:3]
     keys = _keys(turn, np.zeros(turn.lanes, int))
-    simulations = plan.prunes * plan.simulations
-    tree = _make.eval_shape(problem, keys, simulations, plan.memoize, plan.pages, plan.record)
+    tree = _make.eval_shape(problem, keys, *plan.room)
     _, roots = _prune.eval_shape(problem, tree, plan.children, plan.memoize)
     rows = np.zeros(turn.candidates + turn.lanes, np.int32)
     found = _rebuild.eval_shape(problem, tree, rows, rows, plan.memoize)
@@ -159,25 +161,22 @@ def _one_group(turn: Round, number: int, context: UnitContext) -> TreeBatch:
     problem, words, plan, lanes, chunk, candidates, before = turn
     group = np.arange(number * lanes, min((number + 1) * lanes, len(words)))
     keys, group = _keys(turn, np.resize(group, lanes)), group + before
-    tree = _make(
-        problem, keys, plan.prunes * plan.simulations, plan.memoize, plan.pages, plan.record
-    )
-    turns = []
-    for turn in range(plan.prunes):
-        first, end = turn * plan.simulations, (turn + 1) * plan.simulations
-        for at in range(first, end, chunk):
-            tree = jax.block_until_ready(
-                _grow(problem, tree, at, min(at + chunk, end), plan.memoize)
-            )
-            context.more((min(at + chunk, end) - at) * len(group))
+    tree, turns = _make(problem, keys, *plan.room), []
+    for root in range(plan.prunes):
+        last = (root + 1) * plan.simulations
+        for at in range(root * plan.simulations, last, chunk):
+            end = min(at + chunk, last)
+            tree = jax.block_until_ready(_grow(problem, tree, at, end, plan.memoize))
+            context.more((end - at) * len(group))
             if context.stopped():
                 break
         tree, roots = _prune(problem, tree, plan.children, plan.memoize)
         turns.append(jax.device_get(roots))
         if context.stopped() or not np.asarray(tree.alive).any():
             break
-    log, outcome, steps = (
-        np.asarray(a)[..., : len(group)] for a in (tree.log, tree.outcome, tree.steps)
+    log, outcome, steps, trials = jax.tree.map(
+        lambda a: np.asarray(a)[..., : len(group)],
+        (tree.log, tree.outcome, tree.steps, tree.trials),
     )
     lane, i = _candidates(log, outcome, candidates)
     wanted = candidates + len(group)
@@ -189,11 +188,11 @@ def _one_group(turn: Round, number: int, context: UnitContext) -> TreeBatch:
     roots = jax.tree.map(lambda *rows: np.stack(rows), *turns)
     if plan.recount:
         roots = jax.device_get(_recounted(problem, tree, roots, plan.children, plan.memoize))
-    roots = jax.tree.map(lambda a: a[:, : len(group)], roots)
     edges = _edges(problem, tree, plan.children) if plan.edges else ()
     branches = _branches(problem, tree, plan.children) if plan.branches else ()
-    edges, branches = jax.tree.map(lambda a: a[:, : len(group)], jax.device_get((edges, branches)))
-    trials = np.asarray(tree.trials)[..., : len(group)] if plan.record else ()
+    roots, edges, branches = jax.tree.map(
+        lambda a: a[:, : len(group)], jax.device_get((roots, edges, branches))
+    )
     return TreeBatch(
         log=log,
         outcome=outcome,
@@ -279,8 +278,7 @@ def _batchable(treedef: Any, plan: Plan, axes: tuple) -> Callable[..., Traced]:
 
 
 def _traced(problem, axes, keys, plan):
-    room = plan.prunes * plan.simulations, plan.memoize, plan.pages
-    tree = make(problem, keys, *room, axes=axes)
+    tree = make(problem, keys, *plan.room, axes=axes)
 
     def turn(n, tree):
         ends = n * plan.simulations, (n + 1) * plan.simulations
