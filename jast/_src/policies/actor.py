@@ -29,6 +29,7 @@ __all__ = [
     "latent_mixture",
     "make_networks",
     "network_inputs",
+    "parameter_shapes",
     "sample_latents",
 ]
 
@@ -64,9 +65,8 @@ def count_latents(sim: Simulator, function: str) -> tuple[int, int]:
     start, step = ask(sim, lambda start, state, dist: (D.untiltable(start), D.untiltable(dist)))
     if step is not None:
         raise ValueError(f"{function}: disturbance: {step}")
-    return count_numbers(like.x), count_numbers(like.x0) if _floats(
-        like.x0
-    ) and start is None else 0
+    tilted = _floats(like.x0) and start is None
+    return count_numbers(like.x), count_numbers(like.x0) if tilted else 0
 
 
 def _floats(like: Any) -> bool:
@@ -94,6 +94,11 @@ def make_networks(n: int, hidden: tuple[int, ...], components: int) -> tuple[Net
     return tuple(zip(actor, dense(hidden, (), "relu", True), strict=True))
 
 
+def parameter_shapes(init: Callable, inputs: int) -> Any:
+    """The shapes of the parameters that ``init`` makes for a network of so many ``inputs``."""
+    return jax.eval_shape(init, jax.random.key(0), jnp.zeros((inputs,), jnp.float32))
+
+
 def init_parameters(key: jax.Array, shapes: Sequence[Any]) -> list[Any]:
     """Parameters of networks of these ``shapes``, uniform in +-1/sqrt(fan-in) as those of
     `make_head`, by one call of the generator: one for each array takes long to compile.
@@ -117,12 +122,9 @@ def network_inputs(
     kinks the value of a state has its own.
     """
     passed = jnp.asarray(t).astype(jnp.float32) / horizon
-    return jnp.concatenate(
-        [
-            normalisation.inputs.normalise(observation),
-            jnp.stack([passed - 0.5, potential / normalisation.unit]),
-        ]
-    )
+    seen = normalisation.inputs.normalise(observation)
+    more = jnp.stack([passed - 0.5, potential / normalisation.unit])
+    return jnp.concatenate([seen, more])
 
 
 def latent_mixture(apply: Callable, actor: Any, inputs: jax.Array) -> tuple[jax.Array, ...]:
@@ -132,11 +134,8 @@ def latent_mixture(apply: Callable, actor: Any, inputs: jax.Array) -> tuple[jax.
     out = apply(actor, inputs)
     components, n = out.shape[0], (out.shape[1] - 1) // 2
     weights = (1 - UNIFORM_WEIGHT) * jax.nn.softmax(out[:, 0]) + UNIFORM_WEIGHT / components
-    return (
-        jnp.log(weights),
-        out[:, 1 : n + 1] + _initial_means(components, n),
-        jnp.exp(2 * jnp.tanh(out[:, n + 1 :] / 2)),
-    )
+    means = out[:, 1 : n + 1] + _initial_means(components, n)
+    return jnp.log(weights), means, jnp.exp(2 * jnp.tanh(out[:, n + 1 :] / 2))
 
 
 def _initial_means(k: int, n: int) -> jax.Array:

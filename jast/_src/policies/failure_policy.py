@@ -65,12 +65,8 @@ COUNTS = ("episodes", "steps", "invalid")
 
 def history_of(rows: np.ndarray) -> History:
     """The `History` of ``rows`` [n, fields], float64."""
-    return History(
-        *(
-            column.astype(np.int64 if name in COUNTS else np.float64)
-            for name, column in zip(History._fields, rows.T, strict=True)
-        )
-    )
+    columns = zip(History._fields, rows.T, strict=True)
+    return History(*(a.astype(np.int64 if name in COUNTS else np.float64) for name, a in columns))
 
 
 def append_row(rows: np.ndarray, training: Any, totals: Totals) -> np.ndarray:
@@ -163,15 +159,11 @@ class FailurePolicy(Policy):
         for i in sorted({*range(0, last, max(1, last // 8)), last}):
             cells = (f"{getattr(h, field)[i].item():{form}}" for field, _, form in columns)
             table.append(" ".join(cells))
-        if h.invalid[-1]:
-            table.append(
-                f"{h.invalid[-1]} transitions were not finite and were left out of the training"
-            )
+        if n := h.invalid[-1]:
+            table.append(f"{n} transitions were not finite and were left out of the training")
         if self.learned.tilt != ():
-            components = (
-                f"{w:.2f} N({_text(m)}, {_text(s)})"
-                for w, m, s in zip(*self.learned.tilt, strict=True)
-            )
+            parts = zip(*self.learned.tilt, strict=True)
+            components = (f"{w:.2f} N({_text(m)}, {_text(s)})" for w, m, s in parts)
             table.append("start, mean and deviation of its latents: " + " + ".join(components))
         return "\n".join(table)
 
@@ -187,12 +179,8 @@ def assemble(
     ``dense_reward``: whether it sees the distance.
     """
     start = sim.start if learned.tilt == () else Partial(_start, sim.start, learned.tilt)
-    return FailurePolicy(
-        start,
-        Partial(_disturbance, sim, apply, jnp.asarray(dense_reward), learned.actor, learned.net),
-        learned,
-        history,
-    )
+    of = sim, apply, jnp.asarray(dense_reward), learned.actor, learned.net
+    return FailurePolicy(start, Partial(_disturbance, *of), learned, history)
 
 
 def _start(start, tilt):
@@ -200,8 +188,7 @@ def _start(start, tilt):
 
 
 def _disturbance(sim, apply, dense_reward, actor, normalisation, state, t):
-    inputs = network_inputs(
-        normalisation, sim.horizon, observation(sim, state), t, potential(sim, dense_reward, state)
-    )
+    distance = potential(sim, dense_reward, state)
+    inputs = network_inputs(normalisation, sim.horizon, observation(sim, state), t, distance)
     log_w, mean, deviation = latent_mixture(apply, actor, inputs)
     return Blended(sim.disturbance(state), jnp.exp(log_w), mean, deviation)

@@ -77,6 +77,13 @@ class Transitions(NamedTuple):
     done: jax.Array
     next_observation: jax.Array
 
+    def reward(self, scale: jax.Array, bonus: jax.Array) -> jax.Array:
+        """Log p relative to its mode, the shaping and the bonus: Lipkis and Agogino eq. 21;
+        ``scale`` is lambda.
+        """
+        log_p = -0.5 * jnp.sum(self.z**2, axis=-1)
+        return log_p + scale * self.approach + bonus * self.failure.astype(jnp.float32)
+
 
 def lane_at(sim: Simulator, dense_reward: bool, x0: Any, drift: Any = ()) -> Lane:
     """A `Lane` at the start ``x0``; ``dense_reward``: the distance counts at every state."""
@@ -162,13 +169,10 @@ def potential(sim: Simulator, dense_reward: Any, state: Any) -> jax.Array:
 
 def empty_buffer(capacity: int, m: int, n: int) -> Transitions:
     """`Transitions` of zeros, with observations [m] and latents [n]."""
-    shapes = dict(observation=(m,), z=(n,), next_observation=(m,))
-    flags = ("failure", "done")
+    number, flag = jnp.zeros((capacity,), jnp.float32), jnp.zeros((capacity,), bool)
+    seen, z = (jnp.zeros((capacity, k), jnp.float32) for k in (m, n))
     return Transitions(
-        *(
-            jnp.zeros((capacity, *shapes.get(name, ())), bool if name in flags else jnp.float32)
-            for name in Transitions._fields
-        )
+        seen, number, number, z, number, failure=flag, done=flag, next_observation=seen
     )
 
 

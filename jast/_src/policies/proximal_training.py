@@ -25,6 +25,7 @@ from jast._src.policies.actor import (
     latent_mixture,
     make_networks,
     network_inputs,
+    parameter_shapes,
 )
 
 __all__ = [
@@ -67,10 +68,8 @@ class Learner(NamedTuple):
 
 def init_learner(key, m, n, hidden, components, alpha):
     """A `Learner` that has learned nothing, for ``m`` numbers observed."""
-    inputs = jnp.zeros((m + 2,), jnp.float32)
     inits, _ = make_networks(n, hidden, components)
-    shapes = [jax.eval_shape(init, jax.random.key(0), inputs) for init in inits]
-    actor, critic = init_parameters(key, shapes)
+    actor, critic = init_parameters(key, [parameter_shapes(init, m + 2) for init in inits])
     return Learner(actor, critic, jnp.log(alpha), (adam().init(actor), adam().init(critic)))
 
 
@@ -158,26 +157,17 @@ def _batch(training, networks, rates, horizon, rows, valid):
     act, criticise = networks
     lanes, learner = training.lanes, training.learner
     unit = training.normalisation.unit * training.scale
-    states = (
-        jnp.concatenate([before, last.astype(before.dtype)[None]])
-        for before, last in (
-            (rows.observation, lanes.observation),
-            (rows.t, lanes.t),
-            (rows.potential, lanes.potential),
-        )
+    states = jax.tree.map(
+        lambda before, last: jnp.concatenate([before, last.astype(before.dtype)[None]]),
+        (rows.observation, rows.t, rows.potential),
+        (lanes.observation, lanes.t, lanes.potential),
     )
     inputs_of = functools.partial(network_inputs, training.normalisation, horizon)
     inputs = jax.vmap(jax.vmap(inputs_of))(*states)
     value = unit * jax.vmap(jax.vmap(lambda i: criticise(learner.critic, i)))(inputs)
     log_pi = jax.vmap(functools.partial(_log_pi, act, learner.actor))(inputs[:-1], rows.z)
-    # log p relative to its mode, the shaping and the bonus: Lipkis and Agogino eq. 21; the entropy
-    # at the temperature alpha: Haarnoja et al. 2018, eq. 1
-    reward = (
-        -0.5 * jnp.sum(rows.z**2, axis=2)
-        + training.scale * rows.approach
-        + rates.bonus * rows.failure.astype(jnp.float32)
-        - rates.alpha * log_pi
-    )
+    # the entropy at the temperature alpha: Haarnoja et al. 2018, eq. 1
+    reward = rows.reward(training.scale, rates.bonus) - rates.alpha * log_pi
     advantage = advantages(reward, value, rows.done, valid, rates.trace)
     weight = valid.astype(jnp.float32)
     n = jnp.maximum(jnp.sum(weight), 1)

@@ -24,6 +24,7 @@ from jast._src.policies.actor import (
     latent_mixture,
     make_networks,
     network_inputs,
+    parameter_shapes,
 )
 from jast._src.policies.lanes import add_transitions
 
@@ -77,11 +78,8 @@ class Learner(NamedTuple):
 def init_learner(key, m, n, hidden, components, alpha):
     """A `Learner` that has learned nothing, for ``m`` numbers observed."""
     (actor, critic), _ = make_networks(n, hidden, components)
-    shapes = [
-        jax.eval_shape(init, jax.random.key(0), jnp.zeros((size,), jnp.float32))
-        for init, size in ((actor, m + 2), (critic, m + 2 + n))
-    ]
-    actor, one, other = init_parameters(key, (shapes[0], shapes[1], shapes[1]))
+    actor, critic = parameter_shapes(actor, m + 2), parameter_shapes(critic, m + 2 + n)
+    actor, one, other = init_parameters(key, (actor, critic, critic))
     critic = jax.tree.map(lambda a, b: jnp.stack([a, b]), one, other)
     log_alpha = jnp.log(alpha)
     return Learner(
@@ -125,14 +123,8 @@ def update(noise, learner, networks, normalisation, rates, acting, scale, rows, 
     soft = jax.vmap(functools.partial(_soft_values, networks, unit), (None, None, 0, 0))
 
     q, log_pi = soft(learner.actor, learner.target, following, noise[0])
-    # log p relative to its mode, the shaping and the bonus: Lipkis and Agogino eq. 21; the target:
     # Haarnoja eq. 5 with gamma 1
-    reward = (
-        -0.5 * jnp.sum(rows.z**2, axis=1)
-        + scale * rows.approach
-        + rates.bonus * rows.failure.astype(jnp.float32)
-    )
-    target = reward + jnp.where(rows.done, 0, q - alpha * log_pi)
+    target = rows.reward(scale, rates.bonus) + jnp.where(rows.done, 0, q - alpha * log_pi)
 
     def critic_loss(critic: Any) -> jax.Array:
         q = jax.vmap(lambda i, z: _critic_values(networks[1], unit, critic, i, z))(inputs, rows.z)
@@ -155,15 +147,9 @@ def update(noise, learner, networks, normalisation, rates, acting, scale, rows, 
     def follow(average: Any, new: Any) -> Any:
         return jax.tree.map(lambda a, b: a + rates.polyak * (b - a), average, new)
 
-    new = Learner(
-        actor=actor,
-        critic=critic,
-        target=follow(learner.target, critic),
-        average=follow(learner.average, actor),
-        log_alpha=log_alpha,
-        optimiser=(of_actor, of_critic, of_alpha),
-    )
-    return new, loss
+    target, average = follow(learner.target, critic), follow(learner.average, actor)
+    optimiser = of_actor, of_critic, of_alpha
+    return Learner(actor, critic, target, average, log_alpha, optimiser), loss
 
 
 @functools.partial(jax.jit, static_argnames=("config", "networks"))

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jast._src.core.check import OBSERVED, contract
 from jast._src.core.signature import signature_of
 from jast._src.io.codec import Given, check_fits
-from jast._src.policies.actor import count_latents, make_networks
+from jast._src.policies.actor import count_latents, make_networks, parameter_shapes
 from jast._src.policies.failure_policy import FailurePolicy, assemble
 from jast._src.policies.q_learning_training import Table
 from jast._src.policies.start_fit import Tilt
@@ -49,8 +49,8 @@ def whole(path: Any, fields: dict[str, Any], given: Given) -> FailurePolicy:
     layers = learned.actor["params"]
     *hidden, outputs = (len(layers[f"Dense_{i}"]["bias"]) for i in range(len(layers)))
     (init, _), (apply, _) = make_networks(n, tuple(hidden), outputs // (2 * n + 1))
-    seen = jnp.zeros((signature_of(sim).observation[0] + 2,), jnp.float32)
-    check_fits(path, "sim", "actor", learned.actor, jax.eval_shape(init, jax.random.key(0), seen))
+    (m,) = signature_of(sim).observation
+    check_fits(path, "sim", "actor", learned.actor, parameter_shapes(init, m + 2))
     start = ()
     if n0:
         k = len(learned.tilt[0]) if learned.tilt else 0

@@ -93,24 +93,15 @@ def train_policy(
     about = dict(sim=sim, config=config, plan=plan, scale=scale, widen=widen) | about
     with open_checkpoint(function, checkpoint, key, **about) as store:
         kept = _resume(method, store) or _explore(method, plan, sim.horizon, scale, widen)
-        total = plan.total * config.lanes
-        watch = Watch(
-            function, total, "step", progress, callback, done=int(kept[0].step) * config.lanes
-        )
+        done, total = int(kept[0].step) * config.lanes, plan.total * config.lanes
+        watch = Watch(function, total, "step", progress, callback, done=done)
         training, rows = _learn(method, plan, kept, scale is None, watch, store)
     tilt = ()
     if config.n0:
         bonus = jnp.float32(method.bonus)
         tilt = fit_start(for_start, sim, config, training, bonus, method.start_value)
     actor, critic, alpha = method.learned(training)
-    learned = Learned(
-        actor=actor,
-        critic=critic,
-        net=training.normalisation,
-        tilt=tilt,
-        alpha=alpha,
-        scale=training.scale,
-    )
+    learned = Learned(actor, critic, training.normalisation, tilt, alpha, training.scale)
     return assemble(sim, method.actor, config.dense_reward, learned, history_of(rows[1:]))
 
 
@@ -148,9 +139,8 @@ def _learn(method, plan, kept, auto_scale, watch, store):
     try:
         with terminable():
             while (left := plan.total - int(kept[0].step)) > 0:
-                training, totals = jax.block_until_ready(
-                    method.learn(kept[0], min(left, plan.chunk))
-                )
+                steps = min(left, plan.chunk)
+                training, totals = jax.block_until_ready(method.learn(kept[0], steps))
                 rows = append_row(kept[1], training, jax.device_get(totals))
                 last = History(*rows[-1])
                 passed = 1 - (left - plan.chunk) / plan.learning

@@ -154,10 +154,8 @@ def init_training(
 ) -> TrainingState:
     """The `TrainingState` before the first step of a learner of networks."""
     for_lanes, for_networks = jax.random.split(key)
-    learner = init_learner(
-        for_networks, config.m, config.n, config.hidden, config.components, alpha
-    )
-    return begin_training(for_lanes, sim, config, learner)
+    sizes = config.m, config.n, config.hidden, config.components
+    return begin_training(for_lanes, sim, config, init_learner(for_networks, *sizes, alpha))
 
 
 def repeat(
@@ -200,10 +198,7 @@ def step_lanes(
     noise, drift, z0 = _normals(for_noise, (k, n + 1), (k, n), (k, config.n0))
 
     def step(lane, noise):
-        inputs = network_inputs(
-            training.normalisation, sim.horizon, lane.observation, lane.t, lane.potential
-        )
-        mixture = latent_mixture(apply, training.learner.actor, inputs)
+        mixture = latent_mixture(apply, training.learner.actor, _inputs(training, sim, lane))
         z = jnp.where(acting, sample(mixture, noise), lane.drift + noise[:-1])
         return step_lane(sim, config.dense_reward, lane, z)
 
@@ -256,6 +251,12 @@ def explore(
     return repeat(step, training, steps)
 
 
+def _inputs(training: TrainingState, sim: Simulator, lane: Lane) -> jax.Array:
+    """What the networks see of a lane."""
+    seen = lane.observation, lane.t, lane.potential
+    return network_inputs(training.normalisation, sim.horizon, *seen)
+
+
 def _normals(key: jax.Array, *shapes: tuple[int, ...]) -> list[jax.Array]:
     """Standard normal arrays of these shapes, by one call of the generator: each takes long to
     compile.
@@ -303,10 +304,7 @@ def fit_start(
 
     def log_value(z0):
         lane = lane_at(sim, config.dense_reward, x_of(sim.start(), z0))
-        inputs = network_inputs(
-            training.normalisation, sim.horizon, lane.observation, lane.t, lane.potential
-        )
-        v = value(for_value, training, inputs)
+        v = value(for_value, training, _inputs(training, sim, lane))
         ended = jnp.where(lane.failed, bonus, 0)
         return jnp.where(lane.over, ended, v) - training.scale * lane.potential
 
