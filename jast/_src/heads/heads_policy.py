@@ -53,9 +53,8 @@ class Histogram(D.Distribution):
         """Log density; floating disturbances only, since a cell need not hold whole integers."""
         bins = self._logits.shape[1]
         cell = cells(flat(self._actions.locate(value, self._dist)), bins)
-        logs = jnp.take_along_axis(
-            jax.nn.log_softmax(self._logits, axis=1), cell[:, None], axis=1
-        ) + jnp.log(jnp.float32(bins))
+        shares = jax.nn.log_softmax(self._logits, axis=1)
+        logs = jnp.take_along_axis(shares, cell[:, None], axis=1) + jnp.log(jnp.float32(bins))
         base = self._actions.log_prob(value, self._dist)
         return base + jnp.sum(logs).astype(base.dtype)
 
@@ -89,9 +88,8 @@ def as_policy(sim: Simulator, heads: Heads, actions: Actions, power: Numeric = 1
     like = signature_of(sim).x
     if not all(jnp.issubdtype(s.dtype, jnp.floating) for s in jax.tree.leaves(like)):
         raise ValueError(f"heads.as_policy: expected a disturbance of floats, received {like}")
-    return Policy(
-        sim.start, Partial(_disturbance, sim, heads, actions, jnp.asarray(power, jnp.float32))
-    )
+    power = jnp.asarray(power, jnp.float32)
+    return Policy(sim.start, Partial(_disturbance, sim, heads, actions, power))
 
 
 def _disturbance(sim, heads, actions, power, state, t):

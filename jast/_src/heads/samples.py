@@ -50,9 +50,7 @@ def samples_of_roots(sim, actions, roots, bins, good, first=0):
     seen, x, shares = _root_rows(sim, actions, roots, bins)
     good = np.repeat(good, turns)
     use = roots.valid & good & (roots.depth >= first) & (jnp.sum(roots.visits, axis=1) > 0)
-    policy = (
-        None if bins is None else _finite_samples(use, seen, jnp.zeros((seen.shape[0], 0)), shares)
-    )
+    policy = None if bins is None else _policy_samples(use, seen, shares)
     edges = roots.visits > 0
     each = jnp.broadcast_to(seen[:, None], (*edges.shape, seen.shape[1]))
     use = roots.valid & (roots.depth >= first)
@@ -62,10 +60,8 @@ def samples_of_roots(sim, actions, roots, bins, good, first=0):
 
 def join_samples(parts):
     """Several `Samples` as one."""
-    return Samples(
-        *(np.concatenate(columns) for columns in zip(*(p[:3] for p in parts), strict=True)),
-        sum(p.dropped for p in parts),
-    )
+    columns = zip(*(p[:3] for p in parts), strict=True)
+    return Samples(*map(np.concatenate, columns), sum(p.dropped for p in parts))
 
 
 def samples_of_edges(edges, target="own"):
@@ -73,9 +69,8 @@ def samples_of_edges(edges, target="own"):
     that leads to s, as published (``target="parent"``).
     """
     edges = _tree_by_tree(edges)
-    return _finite_samples(
-        edges.valid, edges.seen, edges.x, edges.q if target == "own" else edges.parent_q
-    )
+    q = edges.q if target == "own" else edges.parent_q
+    return _finite_samples(edges.valid, edges.seen, edges.x, q)
 
 
 def samples_of_episodes(sim, actions, episodes, bins, good):
@@ -83,23 +78,20 @@ def samples_of_episodes(sim, actions, episodes, bins, good):
     state, all of the histogram in the cell of what came next.
     """
     seen, shares, use = _episode_rows(sim, actions, episodes._replace(states=None), bins)
-    use, seen, shares = map(_merge, (use & good[:, None], seen, shares))
-    return _finite_samples(use, seen, np.zeros((use.size, 0)), shares)
+    return _policy_samples(*map(_merge, (use & good[:, None], seen, shares)))
 
 
 @functools.partial(jax.jit, static_argnames="bins")
 def _episode_rows(sim, actions, episodes, bins):
     def one(episode):
-        states = play_back(
-            sim, rewards.STANDARD, episode.x0, episode.disturbances, episode.length
-        ).states
+        x0, xs, length = episode.x0, episode.disturbances, episode.length
+        states = play_back(sim, rewards.STANDARD, x0, xs, length).states
 
         def step(state, x):
-            u = flat(actions.locate(x, sim.disturbance(state)))
-            return observation(sim, state), jax.nn.one_hot(cells(u, bins), bins, dtype=jnp.float32)
+            return observation(sim, state), _cell_of(actions, x, sim.disturbance(state), bins)
 
-        rows = jax.vmap(step)(jax.tree.map(lambda a: a[:-1], states), episode.disturbances)
-        return *rows, jnp.arange(sim.horizon, dtype=jnp.int32) < episode.length
+        rows = jax.vmap(step)(jax.tree.map(lambda a: a[:-1], states), xs)
+        return *rows, jnp.arange(sim.horizon, dtype=jnp.int32) < length
 
     return jax.vmap(one)(episodes)
 
@@ -109,17 +101,20 @@ def cells(u, bins):
     return jnp.clip(jnp.floor(u * bins).astype(jnp.int32), 0, bins - 1)
 
 
+def _cell_of(actions, x, dist, bins):
+    """[d, bins]: 1 in the cell of each number of ``x``, else 0."""
+    u = flat(actions.locate(x, dist))
+    return jax.nn.one_hot(cells(u, bins), bins, dtype=jnp.float32)
+
+
 @functools.partial(jax.jit, static_argnames="bins")
 def _root_rows(sim, actions, roots, bins):
     def one(state, xs, visits):
         if bins is None:
             return observation(sim, state), jax.vmap(flat)(xs), ()
-        dist = sim.disturbance(state)
-        u = jax.vmap(lambda x: flat(actions.locate(x, dist)))(xs)  # [K, d]
-        n = visits.astype(jnp.float32)
-        shares = jnp.einsum(
-            "k,kdb->db", n, jax.nn.one_hot(cells(u, bins), bins, dtype=jnp.float32)
-        ) / jnp.maximum(jnp.sum(n), 1)
+        dist, n = sim.disturbance(state), visits.astype(jnp.float32)
+        hits = jax.vmap(lambda x: _cell_of(actions, x, dist, bins))(xs)  # [K, d, bins]
+        shares = jnp.einsum("k,kdb->db", n, hits) / jnp.maximum(jnp.sum(n), 1)
         return observation(sim, state), jax.vmap(flat)(xs), shares
 
     return jax.vmap(one)(roots.state, roots.actions, roots.visits)
@@ -133,6 +128,11 @@ def _merge(a):
 def _tree_by_tree(rows):
     """Rows [n, B, ...] as [B * n, ...]."""
     return jax.tree.map(lambda a: _merge(np.swapaxes(a, 0, 1)), rows)
+
+
+def _policy_samples(use, seen, shares):
+    """`Samples` without disturbances."""
+    return _finite_samples(use, seen, np.zeros((len(seen), 0)), shares)
 
 
 def _finite_samples(use, *columns):

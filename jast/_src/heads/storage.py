@@ -95,26 +95,16 @@ def _specification(head):
         first_activation=bool(module.first_activation),
     )
     like = _made(network).params
-    made = jax.tree.structure(like) == jax.tree.structure(head.params) and shapes == [
-        leaf.shape for leaf in jax.tree.leaves(like)
-    ]
-    return network if made else None
+    same = jax.tree.structure(like) == jax.tree.structure(head.params)
+    return network if same and shapes == [a.shape for a in jax.tree.leaves(like)] else None
 
 
 def _made(network):
     """The `Head` of a specification, with the shapes of its parameters in their place."""
-    init, apply = dense(
-        tuple(network["hidden"]),
-        tuple(network["outputs"]),
-        network["activation"],
-        network["first_activation"],
-    )
-    return Head(
-        jax.eval_shape(
-            lambda: init(jax.random.key(0), jnp.zeros((network["inputs"],), jnp.float32))
-        ),
-        apply,
-    )
+    hidden, outputs = tuple(network["hidden"]), tuple(network["outputs"])
+    init, apply = dense(hidden, outputs, network["activation"], network["first_activation"])
+    seen = jax.ShapeDtypeStruct((network["inputs"],), jnp.float32)
+    return Head(jax.eval_shape(init, jax.random.key(0), seen), apply)
 
 
 def _head(path, name, about, given):

@@ -96,16 +96,8 @@ def train_head(key, head, apply, moments, samples, *, loss, rate, batch, steps, 
         key, head.params, head.optimiser, apply, moments, padded, size, steps, rate, loss, batch
     )
     last = float(last)
-    finite = bool(np.isfinite(last)) and all(
-        bool(jnp.all(jnp.isfinite(a))) for a in jax.tree.leaves(params)
-    )
-    lesson = Lesson(
-        loss=last,
-        steps=steps,
-        samples=len(samples.seen),
-        dropped=samples.dropped,
-        rejected=not finite,
-    )
+    finite = all(bool(jnp.all(jnp.isfinite(a))) for a in (last, *jax.tree.leaves(params)))
+    lesson = Lesson(last, steps, len(samples.seen), samples.dropped, rejected=not finite)
     head = HeadState(params, optimiser, kept) if finite else head._replace(kept=kept)
     return head, lesson
 
@@ -117,9 +109,8 @@ def _fit(key, params, optimiser, apply, moments, data, size, steps, rate, loss, 
     rows = jnp.concatenate([seen, x], axis=1)
     rows, target = jax.vmap(inputs.normalise)(rows), jax.vmap(targets.normalise)(target)
     number = jnp.arange(rows.shape[0], dtype=jnp.int32)
-    order = jnp.argsort(
-        jnp.where(number < size, jax.random.uniform(key, number.shape), 2.0)
-    ).astype(jnp.int32)
+    coins = jax.random.uniform(key, number.shape)
+    order = jnp.argsort(jnp.where(number < size, coins, 2.0)).astype(jnp.int32)
 
     def mean_loss(params, rows, target):
         return jnp.mean(jax.vmap(lambda r, t: LOSSES[loss](apply(params, r), t))(rows, target))
@@ -134,7 +125,6 @@ def _fit(key, params, optimiser, apply, moments, data, size, steps, rate, loss, 
         late = i >= steps - (steps + 9) // 10
         return params, optimiser, total + jnp.where(late, value, 0).astype(total.dtype)
 
-    params, optimiser, total = lax.fori_loop(
-        0, steps, step, (params, optimiser, jnp.zeros((), jnp.float32))
-    )
+    first = params, optimiser, jnp.zeros((), jnp.float32)
+    params, optimiser, total = lax.fori_loop(0, steps, step, first)
     return params, optimiser, total / ((steps + 9) // 10)

@@ -62,14 +62,9 @@ def init_heads(key, sim, actions, heads, settings):
         keys = jax.random.split(key)
 
         def make(i, inputs, outputs):
-            return make_head(
-                keys[i],
-                inputs,
-                outputs,
-                hidden=settings.hidden,
-                activation=settings.activation[i],
-                first_activation=settings.first_activation,
-            )
+            shape = dict(hidden=settings.hidden, activation=settings.activation[i])
+            first = settings.first_activation
+            return make_head(keys[i], inputs, outputs, **shape, first_activation=first)
 
         policy = make(0, n, (d, settings.bins)) if heads in ("rollout", "both") else None
         heads = Heads(policy, make(1, n + d, ()) if heads in ("value", "both") else None)
@@ -161,16 +156,13 @@ def train_heads(key, training, sim, actions, settings, batches):
         inputs = update_moments(inputs, np.concatenate([edges.seen, edges.x], axis=1))
         returns = update_moments(returns, edges.target)
     observed = inputs.first(edges.seen.shape[1]), Moments.empty()
-    work = dict(
-        policy=(settings.loss, shares, observed), value=("squared", edges, (inputs, returns))
-    )
-    if settings.untrained_alone and heads.policy is None:
-        del work["value"]
-    keys, trained, lesson = jax.random.split(key), {}, {}
+    work = (settings.loss, observed, shares), ("squared", (inputs, returns), edges)
+    keys, new, trained, lesson = jax.random.split(key), {}, {}, {}
     for i, name in enumerate(("policy", "value")):
         head, state = getattr(heads, name), getattr(training, name)
-        if head is not None and name in work:
-            loss, samples, moments = work[name]
+        alone = name == "value" and heads.policy is None
+        if head is not None and not (alone and settings.untrained_alone):
+            loss, moments, samples = work[i]
             state, lesson[name] = train_head(
                 keys[i],
                 state,
@@ -184,21 +176,15 @@ def train_heads(key, training, sim, actions, settings, batches):
                 capacity=settings.replay[i],
             )
         trained[name] = state
+        new[name] = state and head._replace(params=state.params)
     levels = heads.levels
     if any(of.steps > 0 and not of.rejected for of in lesson.values()):
-        deepest = (
-            sim.horizon
-            if settings.episodes
-            else max(int(np.where(b.roots.valid, b.roots.depth, 0).max()) for b in batches)
-        )
+        deepest = sim.horizon
+        if not settings.episodes:
+            deepest = max(int(np.where(b.roots.valid, b.roots.depth, 0).max()) for b in batches)
         levels = max(levels, deepest + 1)
-    new = (
-        state and getattr(heads, name)._replace(params=state.params)
-        for name, state in trained.items()
-    )
-    return HeadTraining(
-        Heads(*new, inputs, returns, levels), **trained, lessons=(*training.lessons, lesson)
-    )
+    heads = Heads(**new, inputs=inputs, returns=returns, levels=levels)
+    return HeadTraining(heads, **trained, lessons=(*training.lessons, lesson))
 
 
 def _samples(heads, sim, actions, settings, batches):
@@ -209,14 +195,11 @@ def _samples(heads, sim, actions, settings, batches):
     if heads.policy is not None:
         seen = jnp.zeros((n,), jnp.float32)
         bins = jax.eval_shape(lambda: policy_logits(heads, seen)).shape[1]
-    good = best_trees(batches, settings.elite)
-    pairs = [
-        samples_of_roots(sim, actions, b.roots, bins, g, first)
-        for b, g in zip(batches, good, strict=True)
-    ]
-    shares, edges = ([pair[i] for pair in pairs] for i in range(2))
+    good = list(zip(batches, best_trees(batches, settings.elite), strict=True))
+    pairs = [samples_of_roots(sim, actions, b.roots, bins, g, first) for b, g in good]
+    shares, edges = map(list, zip(*pairs, strict=True))
     if heads.policy is not None and settings.episodes:
-        for b, g in zip(batches, good, strict=True):
+        for b, g in good:
             # the best episode of each tree stands first
             best = jax.tree.map(lambda a, g=g: a[: len(g)], b.found)
             shares.append(samples_of_episodes(sim, actions, best, bins, g))
