@@ -268,7 +268,7 @@ def arrays(draw, names):
 def round_trip(tree):
     tree = jax.tree.map(jnp.asarray, tree)
     words = jax.jit(pack)(tree)
-    like = records.shapes(tree)
+    like = jax.eval_shape(lambda: tree)
     assert words.dtype == jnp.uint32 and words.shape == (records.width(like),)
     return jax.tree.map(np.asarray, jax.jit(lambda w: unpack(w, like))(words))
 

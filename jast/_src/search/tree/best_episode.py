@@ -9,7 +9,7 @@ import jax.numpy as jnp
 
 from jast._src.core.signature import signature_of
 from jast._src.core.simulator import Simulator
-from jast._src.search.tree.packing import pack, shapes, unpack, width
+from jast._src.search.tree.packing import unpack, width
 from jast._src.util.pytrees import select
 
 __all__ = [
@@ -21,7 +21,6 @@ __all__ = [
     "follows",
     "no_lead",
     "update_lead",
-    "packed",
 ]
 
 
@@ -62,7 +61,7 @@ def no_lead(problem, lanes, levels, simulations, dtype):
     zero, low = jnp.zeros((lanes,), jnp.int32), jnp.full((lanes,), -jnp.inf, dtype)
     trail = jnp.zeros((levels + 1, lanes), jnp.int32)
     path = zero > 0, zero, zero, jnp.zeros_like(low), trail, trail[:-1]
-    words = 1 + width(_like(problem.sim))
+    words = width(_fed_row(problem.sim))
     fed = jnp.zeros((simulations + 1, lanes, words), jnp.uint32) if feed else ()
     return Lead(low, zero, *(path if follow else ((),) * 6), fed)
 
@@ -94,7 +93,8 @@ def fed_source(tree, source, lane):
 
 def take_fed(sim, words, here, x):
     """One lane: the disturbance that is fed, where there is one and ``here``; else ``x``."""
-    return select(here & (words[0] > 0), unpack(words[1:], _like(sim)), x)
+    there, fed = unpack(words, _fed_row(sim))
+    return select(here & there, fed, x)
 
 
 def update_lead(tree, walk, fresh, child, value, failed, i, middle):
@@ -126,10 +126,6 @@ def update_lead(tree, walk, fresh, child, value, failed, i, middle):
     )
 
 
-def packed(there, x):
-    """One lane: a row of ``Lead.fed``."""
-    return jnp.concatenate([there.astype(jnp.uint32)[None], pack(x)])
-
-
-def _like(sim: Simulator) -> Any:
-    return shapes(signature_of(sim).x)
+def _fed_row(sim: Simulator) -> Any:
+    """The shapes of what a row of ``Lead.fed`` packs: whether there is anything, and what."""
+    return jax.ShapeDtypeStruct((), jnp.bool_), signature_of(sim).x

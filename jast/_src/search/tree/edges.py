@@ -14,8 +14,6 @@ from jast._src.heads.heads import observation
 from jast._src.search.tree.best_episode import fed_source
 from jast._src.search.tree.layout import (
     CHILD,
-    FAILURE,
-    FRESH,
     LINK,
     PAGE,
     RETURNS,
@@ -23,6 +21,7 @@ from jast._src.search.tree.layout import (
     VISITS,
     choose,
     choose_child,
+    flags,
     levels,
     node_keys,
     nodes_of,
@@ -134,6 +133,7 @@ def branches_of(problem, tree, children, axes=None):
     start, x = jax.vmap(one, in_axes=(axes, 0, *[1] * 6), out_axes=1)(
         problem, tree.key, node.state, parent, slot, level, source, fed
     )
+    failed, *_ = flags(tree.outcome)
     return Branches(
         parent=parent,
         start=start,
@@ -143,7 +143,7 @@ def branches_of(problem, tree, children, axes=None):
         end=valid & (child < 0),
         distance=node.distance[1:],
         reward=tree.log,
-        failure=(tree.outcome & FAILURE) > 0,
+        failure=failed,
     )
 
 
@@ -162,6 +162,7 @@ def _numbers(problem, tree, children):
     at = row * ROW + slot % PAGE
     visits, total = tree.edges[at + VISITS], tree.edges[at + RETURNS]
     own = jnp.take_along_axis(node.reward, parent, axis=0)  # up to s
-    valid = ((tree.outcome & FRESH) > 0) & ~tree.ended[None] & (visits > 0)
+    _, fresh, *_ = flags(tree.outcome)
+    valid = fresh & ~tree.ended[None] & (visits > 0)
     q = jnp.where(valid, problem.q_value(total, visits, own), 0)
     return node, tree.edges[at + CHILD], visits, q, valid

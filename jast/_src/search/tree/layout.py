@@ -38,12 +38,8 @@ from jast._src.util.pytrees import select
 
 __all__ = [
     "CHILD",
-    "FAILURE",
-    "FRESH",
-    "INVALID",
     "LINK",
     "PAGE",
-    "RAN",
     "RETURNS",
     "REWARD",
     "ROW",
@@ -55,6 +51,7 @@ __all__ = [
     "choose",
     "choose_child",
     "choose_rollout",
+    "flags",
     "levels",
     "make",
     "most_lanes",
@@ -62,6 +59,7 @@ __all__ = [
     "node_shapes",
     "nodes_of",
     "of_lanes",
+    "outcome_of",
     "pages_of",
     "take",
     "widths",
@@ -168,7 +166,7 @@ class Tree(NamedTuple):
     log: jax.Array
     """[S, B] float: reward of the episode of each simulation."""
     outcome: jax.Array
-    """[S, B] uint8: bits FAILURE, FRESH (not an end seen before), INVALID, RAN."""
+    """[S, B] uint8: `outcome_of` each simulation."""
     lead: Any
     """`Lead`, the best episode of each tree, or ``()`` where the search makes no use of it."""
     trials: Any
@@ -309,6 +307,20 @@ def make(problem, keys, simulations, memoize="node", pages=None, record=False, a
         lead=lead,
         trials=jnp.zeros((simulations, 2, lanes), dtype) if record else (),
     )
+
+
+def outcome_of(failed, fresh, invalid, ran):
+    """uint8: the flags of simulations, each a bit; 0 where one never ``ran``. ``fresh``: it was no
+    end seen before.
+    """
+    bits = zip((failed, fresh, invalid, ran), (FAILURE, FRESH, INVALID, RAN), strict=True)
+    outcome = sum(jnp.where(flag, bit, 0) for flag, bit in bits)
+    return jnp.where(ran, outcome, 0).astype(jnp.uint8)
+
+
+def flags(outcome):
+    """``failed``, ``fresh``, ``invalid`` and ``ran``, of which `outcome_of` was made."""
+    return [(outcome & bit) > 0 for bit in (FAILURE, FRESH, INVALID, RAN)]
 
 
 def node_shapes(tree, memoize):

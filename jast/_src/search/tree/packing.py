@@ -11,16 +11,14 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-__all__ = ["pack", "shapes", "unpack", "width"]
+__all__ = ["pack", "unpack", "width"]
 
-
-def shapes(tree):
-    """Shapes and dtypes of a pytree of arrays."""
-    return jax.tree.map(lambda a: jax.ShapeDtypeStruct(jnp.shape(a), jnp.result_type(a)), tree)
+SMALL = {1: jnp.uint8, 2: jnp.uint16}
+"""Bytes of a dtype that is less than a word -> the numbers that have its bits."""
 
 
 def width(like):
-    """Words in the record of a pytree of these `shapes`."""
+    """Words in the record of a pytree of arrays, by these or their shapes and dtypes."""
     return sum(math.prod(s.shape) * max(1, s.dtype.itemsize // 4) for s in jax.tree.leaves(like))
 
 
@@ -28,9 +26,8 @@ def pack(tree):
     """The leaves of one pytree (no batch axis) as uint32 [width]; exact for every dtype up to 64
     bits.
     """
-    return jnp.concatenate(
-        [jnp.zeros((0,), jnp.uint32), *(_words(jnp.ravel(a)) for a in jax.tree.leaves(tree))]
-    )
+    none = jnp.zeros((0,), jnp.uint32)
+    return jnp.concatenate([none, *(_words(jnp.ravel(a)) for a in jax.tree.leaves(tree))])
 
 
 def unpack(words, like):
@@ -50,9 +47,7 @@ def _words(a):
     if jnp.issubdtype(a.dtype, jnp.complexfloating):
         return _words(jnp.stack([a.real, a.imag], axis=-1).reshape(-1))
     if a.dtype.itemsize < 4:
-        return lax.bitcast_convert_type(a, {1: jnp.uint8, 2: jnp.uint16}[a.dtype.itemsize]).astype(
-            jnp.uint32
-        )
+        return lax.bitcast_convert_type(a, SMALL[a.dtype.itemsize]).astype(jnp.uint32)
     return lax.bitcast_convert_type(a, jnp.uint32).reshape(-1)
 
 
@@ -63,7 +58,7 @@ def _value(words, dtype):
         parts = _value(words, jnp.finfo(dtype).dtype).reshape(-1, 2)
         return lax.complex(parts[:, 0], parts[:, 1])
     if dtype.itemsize < 4:
-        return lax.bitcast_convert_type(
-            words.astype({1: jnp.uint8, 2: jnp.uint16}[dtype.itemsize]), dtype
-        )
-    return lax.bitcast_convert_type(words.reshape(-1, 2) if dtype.itemsize == 8 else words, dtype)
+        words = words.astype(SMALL[dtype.itemsize])
+    elif dtype.itemsize == 8:
+        words = words.reshape(-1, 2)
+    return lax.bitcast_convert_type(words, dtype)

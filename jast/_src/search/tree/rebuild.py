@@ -10,10 +10,9 @@ from jast._src.core.episode import Episode
 from jast._src.core.transition import blank
 from jast._src.search.tree.best_episode import fed_of, fed_source
 from jast._src.search.tree.layout import (
-    FAILURE,
-    FRESH,
     choose,
     choose_rollout,
+    flags,
     levels,
     nodes_of,
     of_lanes,
@@ -36,8 +35,8 @@ def rebuild(problem, tree, lane, i, memoize="node", axes=None):
 def _one(problem, axes, tree, lane, i, memoize):
     problem = of_lanes(problem, axes, lane)
     key, sim, height = tree.key[lane], problem.sim, levels(problem.sim)
-    outcome = tree.outcome[i, lane]
-    leaf = jnp.where(((outcome & FRESH) > 0) & ~tree.ended[lane], i + 1, 0)
+    failed, fresh, *_ = flags(tree.outcome[i, lane])
+    leaf = jnp.where(fresh & ~tree.ended[lane], i + 1, 0)
 
     def up(node, _):
         of = nodes_of(tree, memoize, tree.nodes[node, lane])
@@ -64,5 +63,5 @@ def _one(problem, axes, tree, lane, i, memoize):
     first = height - sim.horizon
     x0 = jax.tree.map(lambda a: a[0], x0s)
     steps = jnp.sum(lived[first:], dtype=jnp.int32)
-    xs, failure = jax.tree.map(lambda a: a[first:], xs), (outcome & FAILURE) > 0
-    return Episode(x0, xs, end.log_prob, end.distance, failure, steps, tree.log[i, lane])
+    xs = jax.tree.map(lambda a: a[first:], xs)
+    return Episode(x0, xs, end.log_prob, end.distance, failed, steps, tree.log[i, lane])

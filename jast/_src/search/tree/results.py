@@ -11,7 +11,7 @@ from jast._src.core.failures import identity
 from jast._src.search.driver import Log, finish, finish_traced
 from jast._src.search.lanes import NEVER, Tally
 from jast._src.search.result import History, SearchResult, Trials
-from jast._src.search.tree.layout import FAILURE, FRESH, INVALID, RAN
+from jast._src.search.tree.layout import flags
 from jast._src.search.tree.run import Traced, TreeBatch
 
 __all__ = ["result", "traced_result"]
@@ -29,14 +29,14 @@ def result(search: Any, batches: list[TreeBatch], settings: dict, training: Any)
     """
     log = np.concatenate([batch.log for batch in batches], axis=1)
     outcome = np.concatenate([batch.outcome for batch in batches], axis=1)
-    ran, failed, fresh = ((outcome & bit) > 0 for bit in (RAN, FAILURE, FRESH))
+    failed, fresh, invalid, ran = flags(outcome)
     value = np.where(ran, log, -np.inf)
     first = failed.reshape(-1).argmax()
     tally = Tally(
         episodes=int(ran.sum()),
         steps=int(sum(batch.steps.astype(np.int64).sum() for batch in batches)),
         failures=int(failed.sum()),
-        invalid=int(((outcome & INVALID) > 0).sum()),
+        invalid=int(invalid.sum()),
         first=int(ran.reshape(-1)[: first + 1].sum()) if failed.any() else NEVER,
         failing=(failed & fresh).any(0),
     )

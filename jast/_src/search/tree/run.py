@@ -20,7 +20,7 @@ from jast._src.runtime.memory import size
 from jast._src.runtime.progress_bar import Watch
 from jast._src.search.tree import simulate
 from jast._src.search.tree.edges import branches_of, edges_of
-from jast._src.search.tree.layout import FAILURE, FRESH, INVALID, RAN, Problem, make
+from jast._src.search.tree.layout import Problem, flags, make
 from jast._src.search.tree.prune import prune, recounted
 from jast._src.search.tree.rebuild import rebuild
 
@@ -59,7 +59,7 @@ class TreeBatch(NamedTuple):
     log: np.ndarray
     """[S, B] reward of each simulation's episode."""
     outcome: np.ndarray
-    """[S, B] bits FAILURE, FRESH, INVALID, RAN of `search.tree.layout`."""
+    """[S, B] `search.tree.layout.outcome_of` each simulation."""
     steps: np.ndarray
     """[B] simulator steps."""
     roots: Any
@@ -209,8 +209,8 @@ def _one_group(turn: Round, number: int, context: UnitContext) -> TreeBatch:
 
 def _candidates(log, outcome, most):
     """Trees and simulations of the best episode of each tree and of the ``most`` best failures."""
-    fresh = (outcome & FRESH) > 0
-    failure = fresh & ((outcome & FAILURE) > 0)
+    failed, fresh, *_ = flags(outcome)
+    failure = fresh & failed
     value = np.where(fresh, log, -np.inf)
     own = np.where(failure.any(0), np.where(failure, value, -np.inf).argmax(0), value.argmax(0))
     lanes = np.arange(log.shape[1])
@@ -286,7 +286,7 @@ def _traced(problem, axes, keys, plan):
         return prune(problem, tree, plan.children, plan.memoize, axes)[0]
 
     tree = lax.fori_loop(0, plan.prunes, turn, tree)
-    fresh, failed, ran, invalid = ((tree.outcome & b) > 0 for b in (FRESH, FAILURE, RAN, INVALID))
+    failed, fresh, invalid, ran = flags(tree.outcome)
     failing = fresh & failed
     counts = fresh & (failing | ~jnp.any(failing, axis=0)[None])
     value = jnp.where(counts, tree.log, -jnp.inf)

@@ -12,11 +12,10 @@ from jast._src.runtime._jax import is_traced
 from jast._src.search.tree.action_choice import Choice
 from jast._src.search.tree.layout import Problem, Settings, widths
 
-__all__ = ["CHOICES", "PLAIN", "mode_settings", "problem_of"]
+__all__ = ["PLAIN", "mode_settings", "problem_of"]
 
 SWITCHES = ("spread", "follow", "feed", "urgent")
-CHOICES = ("widening", "focus", *SWITCHES)
-"""The settings of a mode."""
+"""The settings of a mode beside ``widening`` and ``focus``."""
 PLAIN = dict(spread=False, focus=1.0, follow=False, feed=False, urgent=False)
 """The settings of a mode that adds nothing to the published search."""
 
@@ -28,7 +27,7 @@ def mode_settings(
 
     Args:
         method: the search, for messages.
-        modes: name of a mode -> its `CHOICES`.
+        modes: name of a mode -> its settings.
         mode: which one.
         actions: of `jast.actions`, which say how near to the mode a ``focus`` of None draws; it
             stays None with actions of None.

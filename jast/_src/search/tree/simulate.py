@@ -12,18 +12,13 @@ from jast._src.search.tree.best_episode import (
     fed_source,
     feed_level,
     follows,
-    packed,
     update_lead,
 )
 from jast._src.search.tree.child_values import evaluate_children
 from jast._src.search.tree.layout import (
     CHILD,
-    FAILURE,
-    FRESH,
-    INVALID,
     LINK,
     PAGE,
-    RAN,
     RETURNS,
     REWARD,
     ROW,
@@ -34,6 +29,7 @@ from jast._src.search.tree.layout import (
     levels,
     nodes_of,
     of_lanes,
+    outcome_of,
     take,
 )
 from jast._src.search.tree.packing import pack
@@ -63,6 +59,9 @@ def _simulation(problem, axes, tree, i, memoize):
     recorded, episodic = not isinstance(tree.trials, tuple), problem.sim.episodic
     source = jnp.where(tree.lead.on & fresh, tree.lead.source, 0) if follows(tree) else ()
 
+    def trial(*numbers):
+        return numbers if recorded else ()
+
     def without_log_p(progress):
         return progress if recorded else progress._replace(log_prob=zero)
 
@@ -84,7 +83,7 @@ def _simulation(problem, axes, tree, i, memoize):
         before = Progress(state, so_far, walk.reward, node.distance, *flags, owed)
         of = walk.node, walk.best.slot, walk.depth, before, source, fed_source(tree, source, lane)
         child = jax.vmap(_child, in_axes=(axes, *[0] * 7))(problem, tree.key, *of)
-        known = node.reward, node.failure, node.invalid, (node.distance, so_far) if recorded else ()
+        known = node.reward, node.failure, node.invalid, trial(node.distance, so_far)
         fed = fed_of(tree, jnp.zeros_like(lane) + i, lane)
         return desk, without_log_p(child), replayed, known, fed
 
@@ -94,9 +93,7 @@ def _simulation(problem, axes, tree, i, memoize):
         blanks = jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), jax.eval_shape(expand)[1:])
         return tree.desk, *blanks
 
-    desk, child, replayed, (known_reward, known_failure, known_invalid, known_trial), fed = (
-        lax.cond(jnp.any(tree.alive), expand, nobody)
-    )
+    desk, child, replayed, known, fed = lax.cond(jnp.any(tree.alive), expand, nobody)
 
     # roll out; lanes that have ended step on, and only what is summed up is masked (and the state,
     # where it is yet to be judged)
@@ -112,7 +109,7 @@ def _simulation(problem, axes, tree, i, memoize):
         kept = select(live, after._replace(state=()), at._replace(state=()))
         if problem.choice.feed:
             here = live & (level == middle)
-            taken = jnp.where(here[:, None], jax.vmap(packed)(here, x), taken)
+            taken = jnp.where(here[:, None], jax.vmap(pack)((here, x)), taken)
         state = select_lanes(live, after.state, at.state) if episodic else after.state
         return level + 1, steps + _one(live), without_log_p(kept._replace(state=state)), taken
 
@@ -128,19 +125,16 @@ def _simulation(problem, axes, tree, i, memoize):
         ended = end._replace(state=()), child._replace(state=())
         child = select(child.done, *ended)._replace(state=child.state)
 
-    value = jnp.where(fresh, end.reward, known_reward)
+    rolled = end.reward, end.failure, end.invalid, trial(end.distance, end.log_prob)
+    value, failed, invalid, numbers = select(fresh, rolled, known)
     finite = jnp.isfinite(value)
     worst = jnp.where(finite & tree.alive, jnp.minimum(tree.worst, value), tree.worst)
     backed = jnp.where(finite, value, jnp.where(jnp.isfinite(worst), worst, 0))
-    first = tree.ended & tree.alive
-    failed = jnp.where(fresh, end.failure, known_failure)
-    invalid = jnp.where(fresh, end.invalid, known_invalid)
-    bits = _bit(fresh | first, FRESH) | _bit(failed, FAILURE) | _bit(invalid, INVALID)
-    bits = jnp.where(tree.alive, bits | jnp.uint8(RAN), 0).astype(jnp.uint8)
+    outcome = outcome_of(failed, fresh | (tree.ended & tree.alive), invalid, tree.alive)
     state = child.state if memoize == "node" else ()
-    numbers = child.reward, child.distance, child.failure, child.invalid
+    told = child.reward, child.distance, child.failure, child.invalid
     log_prob = child.log_prob if recorded else ()
-    kept = Node(walk.node, walk.best.slot, *numbers, state, source, log_prob)
+    kept = Node(walk.node, walk.best.slot, *told, state, source, log_prob)
 
     def put(into, row, at):
         return lax.dynamic_update_slice_in_dim(into, row[None], at, 0)
@@ -149,8 +143,7 @@ def _simulation(problem, axes, tree, i, memoize):
     if isinstance(lead, Lead):
         lead = update_lead(tree, walk, fresh, child, value, failed, i, taken)
     if recorded:
-        trial = select(fresh, (end.distance, end.log_prob), known_trial)
-        trials = put(trials, jnp.stack(trial), i)
+        trials = put(trials, jnp.stack(numbers), i)
     tree = tree._replace(
         edges=_back_up(tree, walk, fresh, child, backed, i + 1, link=not problem.values),
         nodes=put(tree.nodes, jax.vmap(pack)(kept), i + 1),
@@ -161,7 +154,7 @@ def _simulation(problem, axes, tree, i, memoize):
         worst=worst,
         steps=tree.steps + steps + jnp.where(fresh, replayed, 0),
         log=put(tree.log, value, i),
-        outcome=put(tree.outcome, bits, i),
+        outcome=put(tree.outcome, outcome, i),
         alive=tree.alive & ~tree.ended,
         lead=lead,
         trials=trials,
@@ -248,7 +241,3 @@ def child_state(problem, tree_key, parent, slot, level, state, source=(), fed=()
 
 def _one(pred):
     return pred.astype(jnp.int32)
-
-
-def _bit(pred, bit):
-    return jnp.where(pred, bit, 0).astype(jnp.uint8)
