@@ -149,7 +149,6 @@ def set_ranges(
     identity = Moments(*(jnp.asarray(a) for a in Moments.empty(len(low))))
     table = training.learner.actor._replace(low=low, high=high)
     return training._replace(
-        buffer=(),
         learner=training.learner._replace(actor=table),
         normalisation=training.normalisation._replace(inputs=identity),
     )

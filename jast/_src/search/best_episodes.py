@@ -57,9 +57,10 @@ class BestEpisodes(NamedTuple):
         taken = take_or_zero(both, places)
         return taken._replace(value=jnp.where(places < n, taken.value, -jnp.inf), count=counts)
 
+    @jax.jit
     def reward(self) -> jax.Array:
         """That of the best: [1], as of one tree."""
-        return _reward(self)
+        return jnp.where(self.value[:1] > -jnp.inf, self.episode.reward[:1], -jnp.inf)
 
     def result(self, search: Any, log: Log, settings: dict[str, Any]) -> SearchResult:
         """The `SearchResult` of a search (its ``sim``, ``reward`` and ``top``) of one tree."""
@@ -70,11 +71,6 @@ class BestEpisodes(NamedTuple):
             lambda a: a[:n], (best.episode, best.number, best.count)
         )
         return finish(search, log, first, failing, numbers, counts=counts, settings=settings)
-
-
-@jax.jit
-def _reward(best: BestEpisodes) -> jax.Array:
-    return jnp.where(best.value[:1] > -jnp.inf, best.episode.reward[:1], -jnp.inf)
 
 
 def standard_reward(sim: Simulator) -> rewards.Standard:

@@ -231,9 +231,8 @@ def _unit(job, number, context):
         found, tally, played = _block(*about, job.nothing, begin, end, job.lanes)
     else:
         return *_chunk(*about, job.nothing, begin, end, job.lanes), None
-    if not job.record:
-        return found, tally, None
-    return found, tally, jax.tree.map(lambda a: a[: end - begin, None], played.trials())
+    trials = jax.tree.map(lambda a: a[: end - begin, None], played.trials()) if job.record else None
+    return found, tally, trials
 
 
 def _like(job):

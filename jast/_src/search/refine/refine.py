@@ -248,25 +248,24 @@ class _Refinement:
         room = 1 << (max(1, min(POINTS, worth)).bit_length() - 1)
         if 2 * len(self.live) > room or (worth < 1 and self.arrived + self.live):
             return
-        rows = self._next(room - len(self.live))
-        if not rows:
-            return
-        if not self.hosted:
-            self._start_at(rows, lift(self.v[rows]))
-            return
-        for i in range(len(LIFTS)):  # a black box runs farther out only where it must
-            started = self._start_at(rows, lift(self.v[rows])[i : i + 1]) if rows else set()
-            rows = [row for k, row in enumerate(rows) if k not in started]
+        rows, lifts = self._next(room - len(self.live)), [lift(self.v)]
+        if self.hosted:  # a black box runs farther out only where it must
+            lifts = np.split(lifts[0], len(LIFTS))
+        for lifted in lifts:
+            if rows:
+                rows = self._start_at(rows, lifted[:, rows])
 
     def _start_at(self, rows, lifted):
-        """Start where the least of the lifts, [L, n, D] of ``rows``, fails; returns which [m]."""
+        """Start where the least of the lifts, [L, n, D] of ``rows``, fails; returns the rows of
+        which none does.
+        """
         points, failure = first_points(self.of_modes, lifted.reshape(-1, self.v.shape[1]))
         self.spent += len(failure)
         started, places = first_failing_lift(failure, len(rows))
         for k, place in zip(started, places, strict=True):
             point = Point(*(a[place] for a in points))
             self.live.append(_Track(point, int(rows[k]), self.spent))
-        return set(started.tolist())
+        return [row for k, row in enumerate(rows) if k not in started]
 
     def _next(self, n):
         """At most ``n`` of the failures not yet tried: the likeliest; then by turns the likeliest
