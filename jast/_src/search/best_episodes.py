@@ -11,7 +11,7 @@ from jast._src.core.episode import Episode
 from jast._src.core.signature import signature_of
 from jast._src.core.simulator import Simulator
 from jast._src.search.driver import Log, finish
-from jast._src.search.lanes import Played, blank_episodes, distinct_episodes, take_or_zero
+from jast._src.search.lanes import Played, blank_episodes, distinct_episodes, take_rows
 from jast._src.search.result import SearchResult
 
 __all__ = ["BestEpisodes", "standard_reward"]
@@ -54,7 +54,7 @@ class BestEpisodes(NamedTuple):
         both = jax.tree.map(lambda a, b: jnp.concatenate([a, b.astype(a.dtype)]), self, new)
         (k,), (n,) = self.tag.shape, both.tag.shape
         places, counts = distinct_episodes(both.episode.failure, *both[1:5], k)
-        taken = take_or_zero(both, places)
+        taken = take_rows(both, places)
         return taken._replace(value=jnp.where(places < n, taken.value, -jnp.inf), count=counts)
 
     @jax.jit

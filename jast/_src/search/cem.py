@@ -32,13 +32,7 @@ from jast._src.runtime.memory import require_episodes
 from jast._src.search.calibration import with_calibration
 from jast._src.search.cem_proposals import copy_steps, latents_around, make_draw, proposal_kinds
 from jast._src.search.driver import Log, finish, finish_traced, require_counts, run
-from jast._src.search.lanes import (
-    Tally,
-    blank_episodes,
-    distinct_episodes,
-    play_lanes,
-    take_or_zero,
-)
+from jast._src.search.lanes import Tally, blank_episodes, distinct_episodes, play_lanes, take_rows
 from jast._src.search.refine.final import default_share, with_refine_share
 from jast._src.search.result import SearchResult, Trials
 from jast._src.search.setup import default_actions, prepare
@@ -339,7 +333,7 @@ def _merge(elites, new):
         both.episode.failure, both.episode.reward, both.tag, both.number, both.count, k
     )
     there = places < n
-    best = take_or_zero(both, jnp.where(there | (jnp.arange(k) > 0), places, k))
+    best = take_rows(both, jnp.where(there | (jnp.arange(k) > 0), places, k))
     reward = jnp.where(there, best.episode.reward, -jnp.inf)
     return best._replace(episode=best.episode._replace(reward=reward), count=counts)
 
@@ -384,6 +378,6 @@ def _best_failures(elites, top):
     failure, reward = flat.episode.failure, flat.episode.reward
     value = jnp.where(failure, reward, -jnp.inf)
     places, counts = distinct_episodes(failure, value, flat.tag, flat.number, flat.count, top)
-    episode, number = take_or_zero((flat.episode, flat.number), places)
+    episode, number = take_rows((flat.episode, flat.number), places)
     reward = jnp.where(places < trees * k, episode.reward, -jnp.inf)
     return episode._replace(reward=reward), places // k, number, counts

@@ -188,12 +188,9 @@ class _Search:
         return chains, widths.astype(real)
 
     def result(self, state: State, log: Log, settings: dict[str, Any]) -> SearchResult:
+        chains = state.chains
         if state.widths[0]:
-            shares = dict(
-                widths=state.widths,
-                accepted=state.chains.accepted,
-                swapped=state.chains.swapped,
-            )
+            shares = dict(widths=state.widths, accepted=chains.accepted, swapped=chains.swapped)
             shares = {k: np.round(np.asarray(a, float), 4).tolist() for k, a in shares.items()}
             settings = settings | shares
         return state.best.result(self, log, settings)

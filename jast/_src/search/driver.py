@@ -37,16 +37,11 @@ from jast._src.search.result import History, SearchResult, Trials
 from jast._src.util import checks
 
 __all__ = [
-    "NOTHING_NOTED",
     "Log",
     "Noted",
-    "Search",
     "complete",
     "finish",
     "finish_traced",
-    "log_of",
-    "note",
-    "progress_words",
     "require_counts",
     "require_host",
     "run",
@@ -90,12 +85,26 @@ class Log(NamedTuple):
 class Noted(NamedTuple):
     """What is known of the first steps of a search."""
 
-    tally: Tally | None
-    moments: tuple[tuple, ...]
+    tally: Tally | None = None
+    moments: tuple[tuple, ...] = ()
     """Of each step: (its end, the best rewards so far, failures so far, trials or None)."""
 
+    def step(self, end: int, tally: Tally, best: np.ndarray, trials: Trials | None) -> Noted:
+        """These and one step more, which ends at ``end``."""
+        tally = Tally(*(int(v) for v in tally[:5]), tally.failing)  # which do not overflow
+        if self.tally is not None:
+            tally = self.tally.add(tally)
+        return Noted(tally, (*self.moments, (end, best, tally.failures, trials)))
 
-NOTHING_NOTED = Noted(None, ())
+    def words(self) -> dict[str, Any]:
+        """What the bar says of them."""
+        return dict(failures=self.tally.failures, best=f"{self.moments[-1][1].max():.4g}")
+
+    def log(self, interrupted: str | None = None) -> Log:
+        """The `Log` of them."""
+        *moments, trials = zip(*self.moments, strict=True)
+        trials = None if trials[0] is None else jax.tree.map(lambda *a: np.concatenate(a), *trials)
+        return Log(self.tally, History(*(np.array(v) for v in moments)), interrupted, trials)
 
 
 def run(
@@ -153,7 +162,7 @@ def run(
 
         made = (lambda: run_in_thread(step)) if host else step
         state, *news = step_once(made, state, like=structure)
-        noted = note(noted, end, *jax.device_get(news))
+        noted = noted.step(end, *jax.device_get(news))
         failures = noted.tally.failures
         return state, noted
 
@@ -167,15 +176,15 @@ def run(
     with open_checkpoint(name, checkpoint, key, **about) as store, keep_answers(store):
         (state, noted), done = in_pieces(
             piece,
-            (search.init(), NOTHING_NOTED),
+            (search.init(), Noted()),
             ends_left(),
             watch,
             lambda end: end * trees,
-            lambda carry: progress_words(carry[1]),
+            lambda carry: carry[1].words(),
         )
         short = done < ends[-1] and not (stop_at_failure and failures)
         interrupted = f"after {done * trees} of {total} episodes" if short else None
-        found = search.result(state, log_of(noted, interrupted), settings)
+        found = search.result(state, noted.log(interrupted), settings)
         return complete(key, search, found, before, calibration)
 
 
@@ -209,26 +218,6 @@ def require_host(function: str, key: jax.Array, sim: Simulator) -> None:
     checks.check_random_key(function, key)
     if is_traced(key, sim) or is_tracing():
         raise ValueError(f"{function}: cannot be traced; call it outside of jax.jit and jax.vmap")
-
-
-def note(noted: Noted, end: int, tally: Tally, best: np.ndarray, trials: Trials | None) -> Noted:
-    """`Noted` with one step more, which ends at ``end``."""
-    tally = Tally(*(int(v) for v in tally[:5]), tally.failing)  # which do not overflow
-    if noted.tally is not None:
-        tally = noted.tally.add(tally)
-    return Noted(tally, (*noted.moments, (end, best, tally.failures, trials)))
-
-
-def progress_words(noted: Noted) -> dict[str, Any]:
-    """What the bar says of `Noted`."""
-    return dict(failures=noted.tally.failures, best=f"{noted.moments[-1][1].max():.4g}")
-
-
-def log_of(noted: Noted, interrupted: str | None = None) -> Log:
-    """The `Log` of `Noted`."""
-    *moments, trials = zip(*noted.moments, strict=True)
-    trials = None if trials[0] is None else jax.tree.map(lambda *a: np.concatenate(a), *trials)
-    return Log(noted.tally, History(*(np.array(v) for v in moments)), interrupted, trials)
 
 
 def finish(

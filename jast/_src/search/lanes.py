@@ -33,7 +33,7 @@ __all__ = [
     "play_drawn",
     "play_lanes",
     "select_lanes",
-    "take_or_zero",
+    "take_rows",
 ]
 
 
@@ -247,7 +247,7 @@ def distinct_episodes(failure, reward, tag, number, count, k):
     return places, jnp.zeros((k,), jnp.int32).at[to].add(count, mode="drop")
 
 
-def take_or_zero(tree, places):
+def take_rows(tree, places):
     """The rows ``places`` [k] of the leaves [n, ...]; zeros where a place is n or more."""
     return jax.tree.map(lambda a: a.at[places].get(mode="fill", fill_value=0), tree)
 

@@ -25,17 +25,8 @@ from jast._src.runtime.checkpoints import open_checkpoint
 from jast._src.runtime.host_errors import incidents, runs_on_host
 from jast._src.runtime.memory import require
 from jast._src.runtime.progress_bar import Watch
-from jast._src.search.driver import (
-    NOTHING_NOTED,
-    complete,
-    finish,
-    finish_traced,
-    log_of,
-    note,
-    progress_words,
-    require_counts,
-)
-from jast._src.search.lanes import Tally, distinct_episodes, in_blocks, play_drawn, take_or_zero
+from jast._src.search.driver import Noted, complete, finish, finish_traced, require_counts
+from jast._src.search.lanes import Tally, distinct_episodes, in_blocks, play_drawn, take_rows
 from jast._src.search.refine.final import default_share, with_refine_share
 from jast._src.search.result import SearchResult, Trials
 from jast._src.search.setup import prepare
@@ -183,14 +174,14 @@ def monte_carlo(
             Task(_unit, job, lambda: _like(job)),
             -(-episodes // job.stride),
             partial(_with, job),
-            (job.nothing, NOTHING_NOTED),
+            (job.nothing, Noted()),
             watch,
             work.placement(name, executor, devices, store),
             size=lambda done: min(done * job.stride, episodes),
-            words=lambda carry: progress_words(carry[1]),
+            words=lambda carry: carry[1].words(),
         )
     found, noted = ran.state
-    log = log_of(noted, work.describe_missing("episodes", ran, noted.tally.episodes, episodes))
+    log = noted.log(work.describe_missing("episodes", ran, noted.tally.episodes, episodes))
     numbers = np.concatenate([found.number[None], found.top.number])
     rebuilt = jax.device_get(_rebuilt(parts, numbers))
     n = int((found.top.reward > -np.inf).sum())
@@ -245,7 +236,7 @@ def _with(job, carry, number, news):
     new, tally, trials = news
     found = jax.device_get(_merged(found, new))
     end = min((number + 1) * job.stride, job.episodes)
-    return found, note(noted, end, tally, found.reward[None], trials)
+    return found, noted.step(end, tally, found.reward[None], trials)
 
 
 @jax.jit
@@ -261,7 +252,7 @@ def _merged(found, new):
         everywhere = jnp.ones(both.reward.shape, bool)
         places, counts = distinct_episodes(everywhere, *both, len(top.reward))
         reward = both.reward.at[places].get(mode="fill", fill_value=-jnp.inf)
-        return take_or_zero(both, places)._replace(reward=reward, count=counts)
+        return take_rows(both, places)._replace(reward=reward, count=counts)
 
     # rarely anything enters, and sorting is dear; a repetition of the least one is to be counted,
     # too
