@@ -22,7 +22,7 @@ from jast._src.policies.actor import (
     log_normal,
     make_networks,
 )
-from jast._src.policies.lanes import Transitions, add_transitions, empty_buffer, lane_at, step_lane
+from jast._src.policies.lanes import Transitions, lane_at, step_lane
 from jast._src.policies.soft_actor_critic_training import Rates, init_learner, update
 from jast._src.policies.start_fit import _first_components, fit_tilt
 
@@ -195,7 +195,7 @@ def test_what_is_not_finite_is_invalid_and_ends_the_episode(where):
 
 
 def test_the_ring_buffer_holds_the_latest_valid_rows():
-    buffer, stored = empty_buffer(5, 1, 1), jnp.int32(0)
+    buffer, stored = Transitions.empty(5, 1, 1), jnp.int32(0)
     kept = []
     for i in range(4):
         number = jnp.arange(3 * i, 3 * i + 3)
@@ -207,7 +207,7 @@ def test_the_ring_buffer_holds_the_latest_valid_rows():
         )
         valid = jnp.array([True, i % 2 == 0, True])
         kept += [3 * i + j for j in range(3) if valid[j]]
-        buffer, stored = add_transitions(buffer, stored, new, valid)
+        buffer, stored = buffer.put(stored, new, valid)
     assert int(stored) == len(kept) == 10
     assert sorted(np.asarray(buffer.t).tolist()) == kept[-5:]
     np.testing.assert_array_equal(buffer.z[:, 0], buffer.t)

@@ -1,6 +1,7 @@
 """What heads learn from: the statistics of roots, and of all edges, as rows of numbers."""
 
 import functools
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax
@@ -12,14 +13,7 @@ from jast._src.core.episode import play_back
 from jast._src.distributions.flat_rows import flat
 from jast._src.heads.heads import observation
 
-__all__ = [
-    "Samples",
-    "cells",
-    "join_samples",
-    "samples_of_edges",
-    "samples_of_episodes",
-    "samples_of_roots",
-]
+__all__ = ["Samples", "cells", "samples_of_edges", "samples_of_episodes", "samples_of_roots"]
 
 
 class Samples(NamedTuple):
@@ -33,6 +27,12 @@ class Samples(NamedTuple):
     """[m, d, bins] shares of the visits, or [m] rewards to come."""
     dropped: int = 0
     """Rows left out because something in them was not finite."""
+
+    @classmethod
+    def joined(cls, parts: "Sequence[Samples]") -> "Samples":
+        """Several as one."""
+        columns = zip(*(p[:3] for p in parts), strict=True)
+        return cls(*map(np.concatenate, columns), sum(p.dropped for p in parts))
 
 
 def samples_of_roots(sim, actions, roots, bins, good, first=0):
@@ -56,12 +56,6 @@ def samples_of_roots(sim, actions, roots, bins, good, first=0):
     use = roots.valid & (roots.depth >= first)
     value = _finite_samples(*map(_merge, (use[:, None] & edges, each, x, roots.q)))
     return policy, value
-
-
-def join_samples(parts):
-    """Several `Samples` as one."""
-    columns = zip(*(p[:3] for p in parts), strict=True)
-    return Samples(*map(np.concatenate, columns), sum(p.dropped for p in parts))
 
 
 def samples_of_edges(edges, target="own"):

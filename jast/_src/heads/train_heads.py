@@ -23,12 +23,7 @@ from jast._src.heads.heads import (
     update_moments,
 )
 from jast._src.heads.networks import make_head
-from jast._src.heads.samples import (
-    join_samples,
-    samples_of_edges,
-    samples_of_episodes,
-    samples_of_roots,
-)
+from jast._src.heads.samples import Samples, samples_of_edges, samples_of_episodes, samples_of_roots
 from jast._src.heads.train_head import HeadState, init_head, train_head
 from jast._src.runtime._jax import is_traced
 from jast._src.util.pytrees import count_numbers, shapes_text
@@ -205,7 +200,7 @@ def _samples(heads, sim, actions, settings, batches):
             shares.append(samples_of_episodes(sim, actions, best, bins, g))
     if heads.value is not None and settings.edges == "all":
         edges = [samples_of_edges(b.edges, settings.target) for b in batches]
-    return None if heads.policy is None else join_samples(shares), join_samples(edges)
+    return None if heads.policy is None else Samples.joined(shares), Samples.joined(edges)
 
 
 def best_trees(batches, share):

@@ -20,10 +20,9 @@ from jast._src.heads.heads import observation
 from jast._src.policies.actor import Normalisation, latent_mixture, network_inputs
 from jast._src.policies.lanes import potential
 from jast._src.policies.start_fit import Tilt
-from jast._src.policies.training_state import Totals
 from jast._src.util import display
 
-__all__ = ["FailurePolicy", "History", "Learned", "append_row", "assemble", "history_of"]
+__all__ = ["FailurePolicy", "History", "Learned", "assemble"]
 
 
 @display.printable()
@@ -57,37 +56,6 @@ class History(NamedTuple):
     """lambda."""
     invalid: np.ndarray
     """Transitions so far in which a number was not finite: they are left out of the training."""
-
-
-COUNTS = ("episodes", "steps", "invalid")
-"""Fields that are whole numbers, and go on from row to row."""
-
-
-def history_of(rows: np.ndarray) -> History:
-    """The `History` of ``rows`` [n, fields], float64."""
-    columns = zip(History._fields, rows.T, strict=True)
-    return History(*(a.astype(np.int64 if name in COUNTS else np.float64) for name, a in columns))
-
-
-def append_row(rows: np.ndarray, training: Any, totals: Totals) -> np.ndarray:
-    """``rows`` and one more, by the `TrainingState` and its `Totals` since the last row."""
-    last = History(*(rows[-1] if len(rows) else np.zeros(len(History._fields))))
-
-    def ratio(a: Any, b: Any) -> float:
-        return float(a) / float(b) if b else np.nan
-
-    new = History(
-        episodes=last.episodes + totals.episodes,
-        steps=last.steps + totals.steps,
-        mean_return=ratio(totals.log_p + float(training.scale) * totals.gain, totals.valid),
-        failing_share=ratio(totals.failures, totals.valid),
-        log_p=ratio(totals.failing_log_p, totals.failures),
-        alpha=np.exp(float(training.learner.log_alpha)),
-        critic_loss=ratio(totals.loss, totals.updates),
-        scale=float(training.scale),
-        invalid=last.invalid + totals.invalid,
-    )
-    return np.concatenate([rows, np.array([new], np.float64)])
 
 
 class Learned(NamedTuple):

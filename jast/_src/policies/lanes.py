@@ -15,16 +15,7 @@ from jast._src.distributions.mixtures import x_of
 from jast._src.heads.heads import observation
 from jast._src.util.pytrees import select
 
-__all__ = [
-    "Lane",
-    "Transitions",
-    "add_transitions",
-    "begin_lane",
-    "empty_buffer",
-    "lane_at",
-    "potential",
-    "step_lane",
-]
+__all__ = ["Lane", "Transitions", "begin_lane", "lane_at", "potential", "step_lane"]
 
 
 class Lane(NamedTuple):
@@ -76,6 +67,25 @@ class Transitions(NamedTuple):
     failure: jax.Array
     done: jax.Array
     next_observation: jax.Array
+
+    @classmethod
+    def empty(cls, capacity: int, m: int, n: int) -> "Transitions":
+        """Rows of zeros, with observations [m] and latents [n]."""
+        number, flag = jnp.zeros((capacity,), jnp.float32), jnp.zeros((capacity,), bool)
+        seen, z = (jnp.zeros((capacity, k), jnp.float32) for k in (m, n))
+        return cls(seen, number, number, z, number, failure=flag, done=flag, next_observation=seen)
+
+    def put(
+        self, stored: jax.Array, new: "Transitions", valid: jax.Array
+    ) -> tuple["Transitions", jax.Array]:
+        """``(buffer, stored)`` with those of ``new`` [lanes] that are ``valid`` in the places of
+        the oldest ones; ``stored`` counts all that ever were.
+        """
+        capacity = self.t.shape[0]
+        number = stored + jnp.cumsum(valid, dtype=jnp.int32) - 1
+        place = jnp.where(valid, number % capacity, capacity)
+        buffer = jax.tree.map(lambda a, b: a.at[place].set(b, mode="drop"), self, new)
+        return buffer, stored + jnp.sum(valid, dtype=jnp.int32)
 
     def reward(self, scale: jax.Array, bonus: jax.Array) -> jax.Array:
         """Log p relative to its mode, the shaping and the bonus: Lipkis and Agogino eq. 21;
@@ -165,22 +175,3 @@ def potential(sim: Simulator, dense_reward: Any, state: Any) -> jax.Array:
     """The `Lane`'s at a state that is not its last; 0 where the distance is not finite."""
     distance = jnp.asarray(sim.evaluate(state)[1]).astype(jnp.float32)
     return jnp.where(dense_reward & jnp.isfinite(distance), distance, 0)
-
-
-def empty_buffer(capacity: int, m: int, n: int) -> Transitions:
-    """`Transitions` of zeros, with observations [m] and latents [n]."""
-    number, flag = jnp.zeros((capacity,), jnp.float32), jnp.zeros((capacity,), bool)
-    seen, z = (jnp.zeros((capacity, k), jnp.float32) for k in (m, n))
-    return Transitions(
-        seen, number, number, z, number, failure=flag, done=flag, next_observation=seen
-    )
-
-
-def add_transitions(buffer, stored, new, valid):
-    """``(buffer, stored)`` with those of ``new`` [lanes] that are ``valid`` in the places of the
-    oldest ones; ``stored`` counts all that ever were.
-    """
-    capacity = buffer.t.shape[0]
-    place = jnp.where(valid, (stored + jnp.cumsum(valid, dtype=jnp.int32) - 1) % capacity, capacity)
-    buffer = jax.tree.map(lambda a, b: a.at[place].set(b, mode="drop"), buffer, new)
-    return buffer, stored + jnp.sum(valid, dtype=jnp.int32)

@@ -13,7 +13,7 @@ from jast._src.core.typing import Callback, PathLike, PRNGKey
 from jast._src.policies import proximal_training
 from jast._src.policies.actor import make_networks
 from jast._src.policies.failure_policy import FailurePolicy
-from jast._src.policies.lanes import empty_buffer
+from jast._src.policies.lanes import Transitions
 from jast._src.policies.settings import Asked, is_auto
 from jast._src.policies.train_policy import Method, train_policy
 from jast._src.policies.training_state import explore, init_training
@@ -136,7 +136,7 @@ def ppo(
             key, sim, config, steps, epochs, networks, traced, training, n // steps
         )
 
-    batches = jax.eval_shape(lambda: empty_buffer(steps * lanes, config.m, config.n))
+    batches = jax.eval_shape(lambda: Transitions.empty(steps * lanes, config.m, config.n))
     needed = size(jax.eval_shape(begin, key)) + size(batches)
     held = f"{steps} steps of {lanes} lanes between updates, and the networks"
     require("ppo", 2 * needed, held, "use fewer lanes or steps")

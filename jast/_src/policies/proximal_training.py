@@ -30,7 +30,6 @@ from jast._src.policies.actor import (
 
 __all__ = [
     "Batch",
-    "Learner",
     "Rates",
     "advantages",
     "init_learner",

@@ -143,15 +143,16 @@ def sac(
     traced = jax.tree.map(jnp.float32, rates)
 
     def begin(key):
-        return init_training(
-            key, sim, config, soft_actor_critic_training.init_learner, traced.alpha
-        )
+        init_learner = soft_actor_critic_training.init_learner
+        return init_training(key, sim, config, init_learner, traced.alpha)
 
     def learn(key, training, steps, updates=updates):
-        count = jnp.int32(updates)
-        return soft_actor_critic_training.train(
-            key, sim, config, networks, traced, training, count, steps
-        )
+        of = key, sim, config, networks, traced, training, jnp.int32(updates), steps
+        return soft_actor_critic_training.train(*of)
+
+    def learned(training):
+        learner = training.learner
+        return learner.average, learner.target, jnp.exp(learner.log_alpha)
 
     kept = f"a buffer of {config.capacity} steps and the networks"
     require("sac", 2 * size(jax.eval_shape(begin, key)), kept, "use a smaller buffer")
@@ -160,11 +161,7 @@ def sac(
         begin=begin,
         explore=functools.partial(learn, updates=0),
         learn=learn,
-        learned=lambda training: (
-            training.learner.average,
-            training.learner.target,
-            jnp.exp(training.learner.log_alpha),
-        ),
+        learned=learned,
         start_value=soft_actor_critic_training.start_value(networks, config.n),
         bonus=bonus,
         keeps_buffer=True,

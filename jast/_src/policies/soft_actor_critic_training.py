@@ -26,16 +26,8 @@ from jast._src.policies.actor import (
     network_inputs,
     parameter_shapes,
 )
-from jast._src.policies.lanes import add_transitions
 
-__all__ = [
-    "Learner",
-    "Rates",
-    "init_learner",
-    "start_value",
-    "train",
-    "update",
-]
+__all__ = ["Rates", "init_learner", "start_value", "train", "update"]
 
 VALUE_DRAWS = 16  # of the policy, in the value of a start; a convention
 
@@ -173,7 +165,7 @@ def train(
         lanes, new, valid, totals = training_state.step_lanes(
             for_noise, for_starts, sim, config, networks[0], training, acting
         )
-        buffer, stored = add_transitions(training.buffer, training.stored, new, valid)
+        buffer, stored = training.buffer.put(training.stored, new, valid)
         count = jnp.where(stored > 0, updates, 0)
         rate = rates.learning_rate * training_state.learning_rate_left(training, rates.total)
 

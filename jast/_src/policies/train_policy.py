@@ -11,14 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jast._src.policies.failure_policy import (
-    FailurePolicy,
-    History,
-    Learned,
-    append_row,
-    assemble,
-    history_of,
-)
+from jast._src.policies.failure_policy import FailurePolicy, History, Learned, assemble
 from jast._src.policies.settings import Asked, Plan
 from jast._src.policies.training_state import (
     Config,
@@ -41,6 +34,8 @@ ENOUGH_FAILURES = 0.2  # failing share from which lambda is no longer raised
 FIRST_RAISE = 0.2  # part of the learning after which lambda may be raised: the policy follows it
 LAST_RAISE = 0.75  # and up to which: what follows has time to learn
 ROUNDING = 3e-3  # relative deviation of the miss distance that may be rounding of float32 sums
+COUNTS = ("episodes", "steps", "invalid")
+"""Fields of a history that are whole numbers, and go on from row to row."""
 
 
 class Method(NamedTuple):
@@ -102,7 +97,7 @@ def train_policy(
         tilt = fit_start(for_start, sim, config, training, bonus, method.start_value)
     actor, critic, alpha = method.learned(training)
     learned = Learned(actor, critic, training.normalisation, tilt, alpha, training.scale)
-    return assemble(sim, method.actor, config.dense_reward, learned, history_of(rows[1:]))
+    return assemble(sim, method.actor, config.dense_reward, learned, _history(rows[1:]))
 
 
 def _explore(method, plan, horizon, scale, widen):
@@ -126,7 +121,7 @@ def _explore(method, plan, horizon, scale, widen):
         scale = MARGIN * mean / deviation**2 if varies else REACH**2 / unit
     training = training._replace(scale=jnp.float32(scale))
     totals = jax.tree.map(lambda a, b: a + b, *jax.device_get((nominal, around)))
-    rows = append_row(np.zeros((0, len(History._fields))), training, totals)
+    rows = _with_row(np.zeros((0, len(History._fields))), training, totals)
     training = training if method.explored is None else method.explored(training)
     return training if method.keeps_buffer else training._replace(buffer=()), rows
 
@@ -141,7 +136,7 @@ def _learn(method, plan, kept, auto_scale, watch, store):
             while (left := plan.total - int(kept[0].step)) > 0:
                 steps = min(left, plan.chunk)
                 training, totals = jax.block_until_ready(method.learn(kept[0], steps))
-                rows = append_row(kept[1], training, jax.device_get(totals))
+                rows = _with_row(kept[1], training, jax.device_get(totals))
                 last = History(*rows[-1])
                 passed = 1 - (left - plan.chunk) / plan.learning
                 may_raise = auto_scale and FIRST_RAISE < passed < LAST_RAISE
@@ -153,7 +148,7 @@ def _learn(method, plan, kept, auto_scale, watch, store):
                     store.replace(jax.tree.leaves(kept))
                 failing, log_p = f"{last.failing_share:.1%}", f"{last.log_p:.4g}"
                 watch.reach(int(training.step) * lanes, failing=failing, log_p=log_p)
-                watch.tell(lambda rows=rows: history_of(rows[1:]))
+                watch.tell(lambda rows=rows: _history(rows[1:]))
     except KeyboardInterrupt:
         if len(kept[1]) < 2:
             raise
@@ -171,3 +166,30 @@ def _resume(method, store):
     like = like if method.keeps_buffer else like._replace(buffer=())
     *leaves, rows = state
     return jax.tree.structure(like).unflatten(map(jnp.asarray, leaves)), rows
+
+
+def _history(rows: np.ndarray) -> History:
+    """The `History` of ``rows`` [n, fields], float64."""
+    columns = zip(History._fields, rows.T, strict=True)
+    return History(*(a.astype(np.int64 if name in COUNTS else np.float64) for name, a in columns))
+
+
+def _with_row(rows: np.ndarray, training: TrainingState, totals: Totals) -> np.ndarray:
+    """``rows`` and one more, by the state and the `Totals` since the last row."""
+    last = History(*(rows[-1] if len(rows) else np.zeros(len(History._fields))))
+
+    def ratio(a: Any, b: Any) -> float:
+        return float(a) / float(b) if b else np.nan
+
+    new = History(
+        episodes=last.episodes + totals.episodes,
+        steps=last.steps + totals.steps,
+        mean_return=ratio(totals.log_p + float(training.scale) * totals.gain, totals.valid),
+        failing_share=ratio(totals.failures, totals.valid),
+        log_p=ratio(totals.failing_log_p, totals.failures),
+        alpha=np.exp(float(training.learner.log_alpha)),
+        critic_loss=ratio(totals.loss, totals.updates),
+        scale=float(training.scale),
+        invalid=last.invalid + totals.invalid,
+    )
+    return np.concatenate([rows, np.array([new], np.float64)])

@@ -15,15 +15,7 @@ from jast._src.distributions.flat_rows import split
 from jast._src.distributions.mixtures import x_of
 from jast._src.heads.heads import Moments
 from jast._src.policies.actor import Normalisation, latent_mixture, network_inputs, sample_latents
-from jast._src.policies.lanes import (
-    Lane,
-    Transitions,
-    add_transitions,
-    begin_lane,
-    empty_buffer,
-    lane_at,
-    step_lane,
-)
+from jast._src.policies.lanes import Lane, Transitions, begin_lane, lane_at, step_lane
 from jast._src.policies.start_fit import Tilt, fit_tilt
 from jast._src.util.pytrees import count_numbers, select
 
@@ -137,7 +129,7 @@ def begin_training(key: jax.Array, sim: Simulator, config: Config, learner: Any)
     one, moments = jnp.ones((), jnp.float32), Moments.empty(config.m)
     return TrainingState(
         lanes=lanes,
-        buffer=empty_buffer(config.capacity, config.m, config.n),
+        buffer=Transitions.empty(config.capacity, config.m, config.n),
         stored=jnp.zeros((), jnp.int32),
         learner=learner,
         normalisation=Normalisation(Moments(*map(jnp.asarray, moments)), one),
@@ -243,7 +235,7 @@ def explore(
     def step(training):
         keys = jax.random.split(jax.random.fold_in(jax.random.fold_in(key, 0), training.step))
         lanes, new, valid, totals = step_lanes(*keys, sim, config, apply, training, False)
-        buffer, stored = add_transitions(training.buffer, training.stored, new, valid)
+        buffer, stored = training.buffer.put(training.stored, new, valid)
         return training._replace(
             lanes=lanes, buffer=buffer, stored=stored, step=training.step + 1
         ), totals
