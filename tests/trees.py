@@ -9,8 +9,9 @@ from systems import S0, ring
 
 import jast
 from jast._src.search.tree import layout as T
+from jast._src.search.tree import pages as P
 from jast._src.search.tree import run
-from jast._src.search.tree.action_choice import Choice
+from jast._src.search.tree.settings import Choice
 
 FERRY, LANDING, RING = jast.simulators.ferry(), jast.simulators.landing(b=0.3), ring()
 PLAIN = dict(reward=jast.rewards.standard(event_bonus=30.0), actions=jast.actions.samples())
@@ -61,11 +62,11 @@ def slots_of(tree, lane):
     slots of its pages; the only place that knows the layout.
     """
     lanes = tree.key.shape[0]
-    pages = np.asarray(tree.edges, np.float64).reshape(-1, lanes, T.ROW)[:, lane]
+    pages = np.asarray(tree.edges, np.float64).reshape(-1, lanes, P.ROW)[:, lane]
     values = (
-        np.asarray(tree.values, np.float64).reshape(-1, lanes, T.PAGE + 1)[:, lane]
+        np.asarray(tree.values, np.float64).reshape(-1, lanes, P.PAGE + 1)[:, lane]
         if len(tree.values)
-        else np.zeros((len(pages), T.PAGE + 1))
+        else np.zeros((len(pages), P.PAGE + 1))
     )
     made = np.flatnonzero((np.asarray(tree.outcome)[:, lane] & T.FRESH) > 0) + 1
     out = {}
@@ -73,12 +74,12 @@ def slots_of(tree, lane):
         page, found = node, []
         while True:
             row = pages[page]
-            columns = (row[c : c + T.PAGE] for c in (T.VISITS, T.RETURNS, T.CHILD, T.REWARD))
+            columns = (row[c : c + P.PAGE] for c in (P.VISITS, P.RETURNS, P.CHILD, P.REWARD))
             found += [
                 (int(n), w, int(i), r, v)
-                for n, w, i, r, v in zip(*columns, values[page, : T.PAGE], strict=True)
+                for n, w, i, r, v in zip(*columns, values[page, : P.PAGE], strict=True)
             ]
-            page = int(row[T.LINK])
+            page = int(row[P.LINK])
             if page == 0:
                 break
         out[int(node)] = found

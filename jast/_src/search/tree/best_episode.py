@@ -12,16 +12,7 @@ from jast._src.core.simulator import Simulator
 from jast._src.search.tree.packing import unpack, width
 from jast._src.util.pytrees import select
 
-__all__ = [
-    "Lead",
-    "feed_level",
-    "fed_of",
-    "fed_source",
-    "take_fed",
-    "follows",
-    "no_lead",
-    "update_lead",
-]
+__all__ = ["fed_of", "fed_source", "feed_level", "follows", "no_lead", "take_fed", "update_lead"]
 
 
 class Lead(NamedTuple):
@@ -99,9 +90,11 @@ def take_fed(sim, words, here, x):
 
 def update_lead(tree, walk, fresh, child, value, failed, i, middle):
     """The `Lead` after simulation ``i``, whose episodes earned ``value`` [B]; ``middle`` [B,
-    words]: what their rollouts took at `feed_level`.
+    words]: what their rollouts took at `feed_level`. ``()`` where the search wants none.
     """
     lead = tree.lead
+    if not isinstance(lead, Lead):
+        return ()
     better = fresh & jnp.isfinite(value) & (value > lead.value)
     # of failures only: following every better miss costs more finds than it brings
     if follows(tree):

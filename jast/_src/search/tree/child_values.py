@@ -7,16 +7,8 @@ import jax.numpy as jnp
 from jax import lax
 
 from jast._src.search.tree.head_guidance import child_value
-from jast._src.search.tree.layout import (
-    LINK,
-    PAGE,
-    ROW,
-    choose_child,
-    levels,
-    node_keys,
-    nodes_of,
-    of_lanes,
-)
+from jast._src.search.tree.layout import choose_child, node_keys, nodes_of, of_lanes
+from jast._src.search.tree.pages import LINK, PAGE, ROW
 
 __all__ = ["evaluate_children"]
 
@@ -74,7 +66,7 @@ def evaluate_children(problem, axes, tree, walk, fresh, replay, memoize):
             of_lanes(problem, axes, column), node_keys(tree.key[column], node), slot, state
         )
         # the level of a random start has no value: all its children score 0
-        v = jnp.where(level < levels(problem.sim) - problem.sim.horizon, 0, v).astype(values.dtype)
+        v = jnp.where(level < problem.levels - problem.sim.horizon, 0, v).astype(values.dtype)
         to = jnp.where(live, row * (PAGE + 1) + slot % PAGE, nowhere)
         values = values.at[to].set(v, mode="drop")
         link = jnp.where(live & opens[at], last[at] * ROW + LINK, nowhere)

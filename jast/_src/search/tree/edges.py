@@ -12,20 +12,8 @@ from jast._src.core.signature import signature_of
 from jast._src.distributions.flat_rows import flat
 from jast._src.heads.heads import observation
 from jast._src.search.tree.best_episode import fed_source
-from jast._src.search.tree.layout import (
-    CHILD,
-    LINK,
-    PAGE,
-    RETURNS,
-    ROW,
-    VISITS,
-    choose,
-    choose_child,
-    flags,
-    levels,
-    node_keys,
-    nodes_of,
-)
+from jast._src.search.tree.layout import choose, choose_child, flags, node_keys, nodes_of
+from jast._src.search.tree.pages import CHILD, RETURNS, VISITS, edge_of
 from jast._src.util import display
 
 __all__ = ["Branches", "Edges", "branches_of", "edges_of"]
@@ -117,7 +105,7 @@ def branches_of(problem, tree, children, axes=None):
             above, level = at
             return jnp.take_along_axis(node.parent, above, axis=0), level + jnp.sign(above)
 
-        _, level = lax.fori_loop(0, levels(problem.sim), up, (parent, level))
+        _, level = lax.fori_loop(0, problem.levels, up, (parent, level))
         source = source[1:]
     fed = fed_source(tree, source, lane[None])
 
@@ -151,15 +139,9 @@ def _numbers(problem, tree, children):
     """The nodes [S + 1, B], and of the edge that leads to each but the first root [S, B]: the
     child's id, visits, Q, and whether there is such an edge.
     """
-    lanes = tree.key.shape[0]
-    lane = jnp.arange(lanes, dtype=jnp.int32)[None]
     node = nodes_of(tree, "node", tree.nodes)
-    parent, slot = node.parent[1:], node.slot[1:]
-    row = parent * lanes + lane
-    for hop in range(1, -(-children // PAGE)):
-        following = tree.edges[row * ROW + LINK].astype(jnp.int32) * lanes + lane
-        row = jnp.where(slot >= hop * PAGE, following, row)
-    at = row * ROW + slot % PAGE
+    parent = node.parent[1:]
+    at = edge_of(tree, parent, node.slot[1:], children)
     visits, total = tree.edges[at + VISITS], tree.edges[at + RETURNS]
     own = jnp.take_along_axis(node.reward, parent, axis=0)  # up to s
     _, fresh, *_ = flags(tree.outcome)

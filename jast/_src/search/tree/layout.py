@@ -34,16 +34,10 @@ from jast._src.runtime._jax import is_traced
 from jast._src.search.tree.best_episode import feed_level, follows, no_lead, take_fed
 from jast._src.search.tree.head_guidance import rolled
 from jast._src.search.tree.packing import pack, unpack
+from jast._src.search.tree.pages import PAGE, ROW
 from jast._src.util.pytrees import select
 
 __all__ = [
-    "CHILD",
-    "LINK",
-    "PAGE",
-    "RETURNS",
-    "REWARD",
-    "ROW",
-    "VISITS",
     "Node",
     "Problem",
     "Settings",
@@ -65,13 +59,6 @@ __all__ = [
     "widths",
 ]
 
-PAGE = 15  # children on a page: with the link a row of 16, a cache line of 64 bytes
-# columns of a page's row in Tree.edges
-VISITS, RETURNS, CHILD, REWARD = (column * (PAGE + 1) for column in range(4))
-# a page's last entry is no child: there stands the page that continues this one, or 0
-LINK = VISITS + PAGE
-ROW = 4 * (PAGE + 1)  # numbers of a row: four columns
-
 FAILURE, FRESH, INVALID, RAN = 1, 2, 4, 8  # bits of Tree.outcome
 _NODE = np.uint32(1 << 31)  # addresses of children, apart from those of simulations
 
@@ -91,7 +78,7 @@ class Problem(NamedTuple):
     sim: Any
     reward: Any
     choice: Any
-    """`search.tree.action_choice.Choice`."""
+    """`search.tree.settings.Choice`."""
     settings: Settings
     guide: Any = ()
     """`search.tree.head_guidance.Guide`, or ``()`` for a search without heads."""
@@ -100,6 +87,11 @@ class Problem(NamedTuple):
     def values(self):
         """Whether children have a v(s, a)."""
         return self.guide != () and self.guide.heads.value is not None
+
+    @property
+    def levels(self):
+        """`levels` of its simulator."""
+        return levels(self.sim)
 
     def q_value(self, total, visits, before):
         """Q(s, a), 0 where there are no visits: the mean of the returns ``total`` less what was
@@ -235,7 +227,7 @@ def _pages(simulations, levels=0, table=None):
 def pages_of(problem, simulations):
     """Pages of a tree of so many simulations."""
     if problem.values and problem.guide.eager:  # children stand on pages before they are visited
-        return _pages(simulations, levels(problem.sim), problem.settings.widths)
+        return _pages(simulations, problem.levels, problem.settings.widths)
     return _pages(simulations)
 
 
@@ -276,7 +268,7 @@ def make(problem, keys, simulations, memoize="node", pages=None, record=False, a
     first = jax.vmap(origin, in_axes=(axes, 0))(problem, keys)
     dtype = first.reward.dtype
     count = jnp.zeros((lanes,), jnp.int32)
-    lead = no_lead(problem, lanes, levels(problem.sim), simulations, dtype)
+    lead = no_lead(problem, lanes, problem.levels, simulations, dtype)
     told = first.reward, first.distance, first.failure, first.invalid
     state = first.state if memoize == "node" else ()
     source = count if problem.choice.follow else ()
@@ -293,8 +285,8 @@ def make(problem, keys, simulations, memoize="node", pages=None, record=False, a
         root_visits=count + 1,
         root_reward=first.reward,
         depth=count,
-        trail=jnp.zeros((levels(problem.sim) + 1, lanes), jnp.int32),
-        path=jnp.zeros((levels(problem.sim), lanes), jnp.int32),
+        trail=jnp.zeros((problem.levels + 1, lanes), jnp.int32),
+        path=jnp.zeros((problem.levels, lanes), jnp.int32),
         turn=jnp.zeros((2, lanes), dtype),
         alive=jnp.ones((lanes,), bool),
         ended=first.done,

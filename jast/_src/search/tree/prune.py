@@ -10,17 +10,8 @@ from jax import lax
 
 from jast._src.search.lanes import select_lanes
 from jast._src.search.tree.best_episode import fed_source, follows
-from jast._src.search.tree.layout import (
-    CHILD,
-    LINK,
-    PAGE,
-    RETURNS,
-    REWARD,
-    ROW,
-    VISITS,
-    choose,
-    nodes_of,
-)
+from jast._src.search.tree.layout import choose, nodes_of
+from jast._src.search.tree.pages import PAGE, ROW, add_turn, children_of
 from jast._src.search.tree.simulate import child_state, replay_to
 from jast._src.util import display
 
@@ -59,8 +50,8 @@ def prune(problem, tree, children, memoize="node", axes=None):
     root, level = tree.root, tree.depth
     searching = tree.alive & ~tree.ended
     state = _root_state(problem, axes, tree, memoize)
-    tree = _add_turn(tree)
-    pages, visits, total, child, reward = _children(tree, children)
+    tree = add_turn(tree)
+    pages, visits, total, child, reward = children_of(tree, children)
     q = problem.q_value(total, visits, tree.root_reward[:, None])
 
     slots, lane = jnp.arange(children, dtype=jnp.int32), jnp.arange(len(root), dtype=jnp.int32)
@@ -116,48 +107,12 @@ def recounted(problem, tree, roots, children, memoize="node"):
     def one(root):
         node = tree.trail[root.depth, lane]
         reward = nodes_of(tree, memoize, tree.nodes[node, lane]).reward
-        _, visits, total, *_ = _children(tree._replace(root=node), children)
+        _, visits, total, *_ = children_of(tree._replace(root=node), children)
         q = problem.q_value(total, visits, reward[:, None])
         count = jnp.where(root.valid[:, None], visits, 0).astype(jnp.int32)
         return root._replace(visits=count, q=q)
 
     return lax.map(one, roots)
-
-
-def _add_turn(tree):
-    """The visits and returns of this turn, added to the edges above the root: the backup of
-    Algorithm 1 goes to the first root.
-    """
-    place = jnp.arange(tree.path.shape[0], dtype=jnp.int32)[:, None]
-    at = jnp.where(place < tree.depth[None], tree.path, tree.edges.size)
-    places = jnp.stack([at + VISITS, at + RETURNS]).reshape(-1)
-    values = jnp.broadcast_to(tree.turn[:, None], (2, *at.shape)).reshape(-1)
-    return tree._replace(
-        edges=tree.edges.at[places].add(values, mode="drop"), turn=jnp.zeros_like(tree.turn)
-    )
-
-
-def _children(tree, children):
-    """Of each root's children: their pages' rows [B, pages], and [B, children] visits, returns, ids
-    and rewards; 0 where there is none.
-    """
-    (lanes,) = tree.key.shape
-    lane = jnp.arange(lanes, dtype=jnp.int32)
-    edges = tree.edges.reshape(-1, ROW)
-
-    def page(carry, _):
-        row, there = carry
-        record = jnp.where(there[:, None], edges[row], 0)
-        link = record[:, LINK].astype(jnp.int32)
-        return (jnp.where(link > 0, link * lanes + lane, row), there & (link > 0)), (row, record)
-
-    start = (tree.root * lanes + lane, jnp.ones((lanes,), bool))
-    _, (rows, records) = lax.scan(page, start, None, length=-(-children // PAGE))
-    columns = (
-        records[:, :, c : c + PAGE].swapaxes(0, 1).reshape(lanes, -1)[:, :children]
-        for c in (VISITS, RETURNS, CHILD, REWARD)
-    )
-    return rows.T, *columns
 
 
 def _root_state(problem, axes, tree, memoize):

@@ -9,15 +9,7 @@ from jax import lax
 from jast._src.core.episode import Episode
 from jast._src.core.transition import blank
 from jast._src.search.tree.best_episode import fed_of, fed_source
-from jast._src.search.tree.layout import (
-    choose,
-    choose_rollout,
-    flags,
-    levels,
-    nodes_of,
-    of_lanes,
-    take,
-)
+from jast._src.search.tree.layout import choose, choose_rollout, flags, nodes_of, of_lanes, take
 from jast._src.util.pytrees import select, zero_where
 
 __all__ = ["rebuild"]
@@ -34,7 +26,7 @@ def rebuild(problem, tree, lane, i, memoize="node", axes=None):
 
 def _one(problem, axes, tree, lane, i, memoize):
     problem = of_lanes(problem, axes, lane)
-    key, sim, height = tree.key[lane], problem.sim, levels(problem.sim)
+    key, sim, height = tree.key[lane], problem.sim, problem.levels
     failed, fresh, *_ = flags(tree.outcome[i, lane])
     leaf = jnp.where(fresh & ~tree.ended[lane], i + 1, 0)
 

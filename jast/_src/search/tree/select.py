@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jax import lax
 
 from jast._src.search.tree.best_episode import follows
-from jast._src.search.tree.layout import CHILD, LINK, PAGE, RETURNS, REWARD, ROW, VISITS
+from jast._src.search.tree.pages import CHILD, LINK, PAGE, RETURNS, REWARD, ROW, VISITS
 from jast._src.util.pytrees import select
 
 __all__ = ["Best", "Walk", "walk_down"]

@@ -6,33 +6,19 @@ from jax import lax
 
 from jast._src.core.transition import Progress, blank, conclude
 from jast._src.search.lanes import select_lanes
-from jast._src.search.tree.best_episode import (
-    Lead,
-    fed_of,
-    fed_source,
-    feed_level,
-    follows,
-    update_lead,
-)
+from jast._src.search.tree.best_episode import fed_of, fed_source, feed_level, follows, update_lead
 from jast._src.search.tree.child_values import evaluate_children
 from jast._src.search.tree.layout import (
-    CHILD,
-    LINK,
-    PAGE,
-    RETURNS,
-    REWARD,
-    ROW,
-    VISITS,
     Node,
     choose,
     choose_rollout,
-    levels,
     nodes_of,
     of_lanes,
     outcome_of,
     take,
 )
 from jast._src.search.tree.packing import pack
+from jast._src.search.tree.pages import back_up, fills
 from jast._src.search.tree.select import walk_down
 from jast._src.util.pytrees import select
 
@@ -114,7 +100,7 @@ def _simulation(problem, axes, tree, i, memoize):
         return level + 1, steps + _one(live), without_log_p(kept._replace(state=state)), taken
 
     # a random start is a level, but no step
-    steps = _one(fresh & (walk.depth >= levels(problem.sim) - problem.sim.horizon))
+    steps = _one(fresh & (walk.depth >= problem.levels - problem.sim.horizon))
     taken = jnp.zeros_like(fed) if problem.choice.feed else ()
     carry = walk.depth + 1, steps, child._replace(done=child.done | ~fresh), taken
     _, steps, end, taken = lax.while_loop(lambda c: jnp.any(~c[2].done), roll, carry)
@@ -139,16 +125,11 @@ def _simulation(problem, axes, tree, i, memoize):
     def put(into, row, at):
         return lax.dynamic_update_slice_in_dim(into, row[None], at, 0)
 
-    lead, trials = tree.lead, tree.trials
-    if isinstance(lead, Lead):
-        lead = update_lead(tree, walk, fresh, child, value, failed, i, taken)
-    if recorded:
-        trials = put(trials, jnp.stack(numbers), i)
     tree = tree._replace(
-        edges=_back_up(tree, walk, fresh, child, backed, i + 1, link=not problem.values),
+        edges=back_up(tree, walk, fresh, child, backed, i + 1, link=not problem.values),
         nodes=put(tree.nodes, jax.vmap(pack)(kept), i + 1),
         desk=desk,
-        pages=tree.pages if problem.values else tree.pages + _one(fresh & _fills(walk)),
+        pages=tree.pages if problem.values else tree.pages + _one(fresh & fills(walk)),
         root_visits=tree.root_visits + _one(tree.alive),
         turn=tree.turn + jnp.where(tree.alive, jnp.stack([jnp.ones_like(backed), backed]), 0),
         worst=worst,
@@ -156,8 +137,8 @@ def _simulation(problem, axes, tree, i, memoize):
         log=put(tree.log, value, i),
         outcome=put(tree.outcome, outcome, i),
         alive=tree.alive & ~tree.ended,
-        lead=lead,
-        trials=trials,
+        lead=update_lead(tree, walk, fresh, child, value, failed, i, taken),
+        trials=put(tree.trials, jnp.stack(numbers), i) if recorded else (),
     )
     if not problem.values:
         return tree
@@ -166,31 +147,6 @@ def _simulation(problem, axes, tree, i, memoize):
         return replay_to(problem, axes, tree, walk.trail, level, memoize, lane, live)
 
     return evaluate_children(problem, axes, tree, walk, fresh, replay, memoize)
-
-
-def _back_up(tree, walk, fresh, child, value, new, link):
-    """The edges with one more visit and return along each path, and the new children in their
-    slots: one scatter, since what is new was 0.
-    """
-    nowhere = tree.edges.size
-    level = jnp.arange(tree.path.shape[0], dtype=jnp.int32)[:, None]
-    last = walk.depth + _one(tree.alive & ~tree.ended)
-    between = (level >= tree.depth[None]) & (level < last[None])
-    at = jnp.where(between, walk.path, nowhere).reshape(-1)
-    ids = jnp.where(child.done, -new, new).astype(tree.edges.dtype)
-    slot = jnp.where(fresh, walk.best.edge, nowhere)
-    returns = jnp.broadcast_to(value[None], walk.path.shape).reshape(-1)
-    places = [at + VISITS, at + RETURNS, slot + CHILD, slot + REWARD]
-    values = [jnp.ones_like(returns), returns, ids, child.reward]
-    if link:  # where the page is full now, another goes on
-        places.append(jnp.where(fresh & _fills(walk), walk.best.edge // ROW * ROW + LINK, nowhere))
-        values.append(tree.pages.astype(tree.edges.dtype))
-    return tree.edges.at[jnp.concatenate(places)].add(jnp.concatenate(values), mode="drop")
-
-
-def _fills(walk):
-    """Whether the chosen slot is the last of its page."""
-    return walk.best.edge % ROW == PAGE - 1
 
 
 def replay_to(problem, axes, tree, trail, depth, memoize, lane=None, live=None):
@@ -219,7 +175,7 @@ def replay_to(problem, axes, tree, trail, depth, memoize, lane=None, live=None):
         return level + _one(live), select_lanes(live, after, state)
 
     _, state = lax.while_loop(lambda c: jnp.any(running & (c[0] < depth)), body, (first, base))
-    chosen = levels(problem.sim) - problem.sim.horizon  # a random start is a level, but no step
+    chosen = problem.levels - problem.sim.horizon  # a random start is a level, but no step
     return state, jnp.maximum(depth, chosen) - jnp.maximum(first, chosen)
 
 
