@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from jast._src.specs.formulas import Formula, Implies, Not, Predicate, Until, children
+from jast._src.specs.formulas import Formula, Temporal, Until, children
 from jast._src.specs.robustness import Values, margins, robustness, samples_in, spacing, values
 from jast._src.util import display
 
@@ -133,7 +133,7 @@ def parts(formula: Formula, trace: Any, dt: float, *, goes_on: bool = False) -> 
 
 def _moments(f: Formula, v: Values, at: int | None, dt: float) -> list[int | None]:
     """When the parts of ``f`` are asked, which is itself asked ``at``."""
-    if at is None or isinstance(f, Predicate | Not | Implies) or not hasattr(f, "b"):
+    if at is None or not isinstance(f, Temporal | Until):
         return [at] * len(v.parts)
     if not np.isfinite(v.own[at]):  # open yet
         return [None] * len(v.parts)

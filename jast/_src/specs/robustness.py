@@ -10,8 +10,7 @@ end where it is asked for, or has no sample because it is narrower than dt, is a
 """
 
 import math
-from collections.abc import Callable
-from functools import partial
+from functools import partial, reduce
 from typing import Any, NamedTuple
 
 import jax
@@ -31,7 +30,7 @@ from jast._src.specs.formulas import (
     children,
     predicates,
 )
-from jast._src.util.checks import real_number
+from jast._src.util.checks import number, real_number
 
 __all__ = ["Values", "fits", "margins", "reach", "robustness", "samples_in", "spacing", "values"]
 
@@ -87,7 +86,7 @@ def robustness(
         >>> slope.tolist()  # the sample that decides
         [-0.0, -1.0, -0.0]
     """
-    dt, length = spacing("robustness", dt), _length("robustness", trace)
+    dt, length = spacing("robustness", dt), _length(trace)
     if temperature is not None:
         temperature = real_number(
             "robustness", "temperature", temperature, lambda v: v > 0, "above 0"
@@ -96,7 +95,7 @@ def robustness(
         fits("robustness", formula, length, dt)
     found = _robustness(formula, trace, temperature, dt, goes_on)
     if not is_traced(found) and np.isnan(found):
-        _refuse_nan("robustness", formula, trace, dt)
+        _refuse_nan(formula, trace, dt)
     return found
 
 
@@ -144,7 +143,7 @@ def values(
             return Values(pair.most(-x[0], x[1]), parts)
         if isinstance(f, Junction):
             op = pair.least if f.kind == "&" else pair.most
-            return Values(_chained(op, x), parts)
+            return Values(reduce(op, x), parts)
         inf = jnp.asarray(jnp.inf, x[0].dtype)
         least = jnp.where(unknown, sign * inf, inf)  # of what is beyond the end, for the least
         most = jnp.where(unknown, sign * inf, -inf)
@@ -190,12 +189,7 @@ def fits(function: str, formula: Formula, length: int, dt: float) -> None:
                     f" where its window begins after the trace's end, {end * dt:g} s; let the"
                     f" outer window end at {(end - first) * dt:g} s or before"
                 )
-            whole = end if last is None else min(latest + last, end)
-            if isinstance(f, Until):
-                look(f.left, whole)
-                look(f.right, whole)
-                return
-            latest = whole
+            latest = end if last is None else min(latest + last, end)
         for child in children(f):
             look(child, latest)
 
@@ -228,28 +222,17 @@ def samples_in(function: str, f: Temporal | Until, dt: float) -> tuple[int, int 
 
 def spacing(function: str, dt: Any) -> float:
     """``dt`` as a Python float."""
-    good = not is_traced(dt) and not isinstance(dt, bool | str) and np.ndim(dt) == 0
-    try:
-        dt = float(dt) if good else dt
-    except (TypeError, ValueError):
-        good = False
-    if not (good and 0 < dt < math.inf):
-        raise ValueError(f"{function}: dt must be a number of seconds above 0, received {dt!r}")
-    return dt
+    expected = "of seconds above 0"
+    if is_traced(dt):
+        raise ValueError(f"{function}: dt must be a number {expected}, received {dt!r}")
+    return number(function, "dt", dt, lambda v: 0 < v < math.inf, expected)
 
 
-def _chained(op: Callable, x: list[jax.Array]) -> jax.Array:
-    found = x[0]
-    for each in x[1:]:
-        found = op(found, each)
-    return found
-
-
-def _length(function: str, trace: Any) -> int:
+def _length(trace: Any) -> int:
     lengths = {jnp.shape(a)[0] if jnp.ndim(a) else -1 for a in jax.tree.leaves(trace)}
     if len(lengths) != 1 or min(lengths) < 1:
         raise ValueError(
-            f"{function}: trace must be arrays [T, ...] with one T of at least 1, received"
+            "robustness: trace must be arrays [T, ...] with one T of at least 1, received"
             f" {jax.tree.map(jnp.shape, trace)}"
         )
     return lengths.pop()
@@ -276,15 +259,15 @@ def _margin(function: str, p: Predicate, trace: Any) -> jax.Array:
     return jax.vmap(p.margin)(jax.tree.map(jnp.asarray, trace))
 
 
-def _refuse_nan(function: str, formula: Formula, trace: Any, dt: float) -> None:
-    given = jax.device_get(margins(function, formula, trace))
+def _refuse_nan(formula: Formula, trace: Any, dt: float) -> None:
+    given = jax.device_get(margins("robustness", formula, trace))
     for p, m in zip(predicates(formula), given, strict=True):
         if np.isnan(m).any():
             when = float(np.flatnonzero(np.isnan(m))[0] * dt)
             raise ValueError(
-                f"{function}: {p}: the predicate must return a number, received NaN at {when:g} s"
+                f"robustness: {p}: the predicate must return a number, received NaN at {when:g} s"
             )
     raise ValueError(
-        f"{function}: {formula}: predicates must return finite numbers, received infinite ones of"
+        f"robustness: {formula}: predicates must return finite numbers, received infinite ones of"
         " both signs, which give NaN"
     )

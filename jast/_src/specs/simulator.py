@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -118,9 +119,8 @@ def under(
         raise ValueError(f"under: samples must be a function of the state, received {samples!r}")
     contract("under", sim)
     samples = samples if samples is None else as_partial(samples)
-    signature, dt = signature_of(sim), spacing("under", dt)
-    watch = _Watch(sim=sim, formula=formula, samples=samples, dt=dt, total=0)
-    rows = jax.eval_shape(lambda: _samples_of(watch, _zeros(signature.state)))
+    state, dt = signature_of(sim).state, spacing("under", dt)
+    rows = jax.eval_shape(partial(_samples_of, samples), state)
     sizes = {a.shape[0] if a.ndim else 0 for a in jax.tree.leaves(rows)}
     if len(sizes) != 1 or 0 in sizes:
         raise ValueError(
@@ -130,22 +130,20 @@ def under(
     total = sim.horizon * sizes.pop() + 1
     fits("under", formula, total, dt)
     watch = _Watch(sim=sim, formula=formula, samples=samples, dt=dt, total=total)
-    shapes = jax.eval_shape(
-        lambda: margins("under", formula, _samples_of(watch, _zeros(signature.state)))
-    )
+    shapes = jax.eval_shape(lambda s: margins("under", formula, _samples_of(samples, s)), state)
     watched = dict(
         init=Partial(_init, watch),
         step=Partial(_step, watch),
-        disturbance=Partial(_disturbance, watch),
+        disturbance=Partial(_of_the_system, sim.disturbance),
         horizon=sim.horizon,
         start=sim.start,
-        observe=Partial(_observe, watch),
+        observe=Partial(_of_the_system, sim.observe),
     )
     if _open_at_first(watch, shapes[0].dtype):
         end = Partial(_over, watch)
         return Simulator(evaluate=_evaluate, is_terminal=end, episodic=True, **watched)
-    evaluate = Partial(_evaluate_step, watch)
-    return Simulator(evaluate=evaluate, is_terminal=Partial(_ended, watch), **watched)
+    evaluate, end = Partial(_evaluate_step, watch), Partial(_of_the_system, sim.is_terminal)
+    return Simulator(evaluate=evaluate, is_terminal=end, **watched)
 
 
 def trace_of(episode: Episode, samples: Callable[[Any], Any] | None = None) -> Any:
@@ -175,8 +173,7 @@ def trace_of(episode: Episode, samples: Callable[[Any], Any] | None = None) -> A
     states = jax.tree.map(lambda a: np.asarray(a)[:n], episode.states.state)
     if samples is None:
         return states
-    rows = jax.vmap(samples)(states)
-    rows = jax.tree.map(np.asarray, rows)
+    rows = jax.tree.map(np.asarray, jax.vmap(samples)(states))
     return jax.tree.map(
         lambda a: np.concatenate([a[0, -1:], a[1:].reshape(-1, *a.shape[2:])]), rows
     )
@@ -216,7 +213,7 @@ def _monitored(function: str, episode: Any) -> Monitored:
 
 def _init(watch: _Watch, x0: Any) -> Monitored:
     state = watch.sim.init(x0)
-    rows = jax.tree.map(lambda a: a[-1:], _samples_of(watch, state))
+    rows = jax.tree.map(lambda a: a[-1:], _samples_of(watch.samples, state))
     given = margins("under", watch.formula, rows)
     memory = monitor.begin(watch.formula, watch.dt, watch.total, given[0].dtype)
     start = jnp.zeros((), jnp.int32)
@@ -225,7 +222,7 @@ def _init(watch: _Watch, x0: Any) -> Monitored:
 
 def _step(watch: _Watch, s: Monitored, x: Any) -> Monitored:
     state = watch.sim.step(s.state, x)
-    given = margins("under", watch.formula, _samples_of(watch, state))
+    given = margins("under", watch.formula, _samples_of(watch.samples, state))
     told = tuple(a + b for a, b in zip(s.told, _log_p_of_evaluate(watch, state), strict=True))
     return _observed_to(watch, state, s.samples, s.memory, given, told)
 
@@ -249,18 +246,15 @@ def _observed_to(
     )
 
 
-def _samples_of(watch: _Watch, state: Any) -> Any:
-    if watch.samples is None:
+def _samples_of(samples: Callable[[Any], Any] | None, state: Any) -> Any:
+    if samples is None:
         return jax.tree.map(lambda a: jnp.asarray(a)[None], state)
-    return watch.samples(state)
+    return samples(state)
 
 
-def _disturbance(watch: _Watch, s: Monitored) -> Any:
-    return watch.sim.disturbance(s.state)
-
-
-def _observe(watch: _Watch, s: Monitored) -> Any:
-    return watch.sim.observe(s.state)
+def _of_the_system(function: Callable[[Any], Any], s: Monitored) -> Any:
+    """What the system's own function says of the system's own state."""
+    return function(s.state)
 
 
 def _evaluate_step(watch: _Watch, s: Monitored) -> tuple[jax.Array, ...]:
@@ -273,10 +267,6 @@ def _evaluate(s: Monitored) -> tuple[jax.Array, ...]:
     return s.robustness < 0, jnp.clip(s.robustness, 0, most), *s.told
 
 
-def _ended(watch: _Watch, s: Monitored) -> Any:
-    return watch.sim.is_terminal(s.state)
-
-
 def _over(watch: _Watch, s: Monitored) -> Any:
     return (s.robustness < 0) | watch.sim.is_terminal(s.state)
 
@@ -286,14 +276,7 @@ def _open_at_first(watch: _Watch, dtype: Any) -> bool:
     given = tuple(jnp.zeros(1, dtype) for _ in predicates(watch.formula))
     memory = monitor.begin(watch.formula, watch.dt, watch.total, dtype)
 
-    def bound() -> jax.Array:
-        unknown = jnp.ones((), bool)
-        start = jnp.zeros((), jnp.int32)
-        return monitor.push(watch.formula, memory, given, start, unknown, watch.dt, watch.total)[1]
-
     with jax.ensure_compile_time_eval():
-        return bool(jnp.isinf(bound()))
-
-
-def _zeros(like: Any) -> Any:
-    return jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), like)
+        start, unknown = jnp.zeros((), jnp.int32), jnp.ones((), bool)
+        _, bound = monitor.push(watch.formula, memory, given, start, unknown, watch.dt, watch.total)
+        return bool(jnp.isinf(bound))
