@@ -75,7 +75,7 @@ def differentiable(sim, z):
 
 def _one(sim, start):
     def step(carry, i):
-        z, best, found, nearest, least, counts = carry
+        z, so_far = carry
 
         def distance(z):
             e = differentiable(sim, z)
@@ -103,45 +103,40 @@ def _one(sim, start):
         number = jnp.arange(HALVINGS + 1, dtype=jnp.int32)
         (outside, inside), (failures_there, lengths) = jax.lax.scan(halve, (z, aim), number)
         fails = failures_there[0]
-        better = fails & (~found | (jnp.sum(inside**2) < jnp.sum(best**2)))
+        closer = jnp.sum(inside**2) < jnp.sum(so_far.point**2)
+        better = fails & (~so_far.found | closer)
+        nearer = jnp.isfinite(g) & (g < so_far.distance)
         whole = partial(jnp.sum, dtype=jnp.int32)
         failing = whole(e.failure) + whole(failures_there)
-        useful, failures, invalid, first, slopes, steps = counts
-        counts = (
-            useful + whole(usable),
-            failures + failing,
-            invalid + whole(~jnp.isfinite(g)),
-            jnp.where((failing > 0) & (first == STEPS), i, first),
-            slopes + e.length,
-            steps + whole(lengths),
-        )
-        nearer = jnp.isfinite(g) & (g < least)
         return (
             jnp.where(fails, outside, aim),
-            jnp.where(better, inside, best),
-            found | fails,
-            jnp.where(nearer, z, nearest),
-            jnp.where(nearer, g, least),
-            counts,
+            Descents(
+                point=jnp.where(better, inside, so_far.point),
+                found=so_far.found | fails,
+                nearest=jnp.where(nearer, z, so_far.nearest),
+                distance=jnp.where(nearer, g, so_far.distance),
+                useful=so_far.useful + whole(usable),
+                failing=so_far.failing + failing,
+                invalid=so_far.invalid + whole(~jnp.isfinite(g)),
+                first=jnp.where((failing > 0) & (so_far.first == STEPS), i, so_far.first),
+                slopes=so_far.slopes + e.length,
+                steps=so_far.steps + whole(lengths),
+            ),
         ), None
 
     none = jnp.zeros((), jnp.int32)
     like = jax.eval_shape(lambda z: outcome(sim, z).distance, start)
-    least = jnp.asarray(jnp.inf, like.dtype)
-    counts = none, none, none, none + STEPS, none, none
-    first = start, start, jnp.zeros((), bool), start, least, counts
-    index = jnp.arange(STEPS, dtype=jnp.int32)
-    (_, best, found, nearest, least, counts), _ = jax.lax.scan(step, first, index)
-    useful, failing, invalid, first, slopes, steps = counts
-    return Descents(
-        point=best,
-        found=found,
-        nearest=nearest,
-        distance=least,
-        useful=useful,
-        failing=failing,
-        invalid=invalid,
-        first=first,
-        slopes=slopes,
-        steps=steps,
+    nothing = Descents(
+        point=start,
+        found=jnp.zeros((), bool),
+        nearest=start,
+        distance=jnp.asarray(jnp.inf, like.dtype),
+        useful=none,
+        failing=none,
+        invalid=none,
+        first=none + STEPS,
+        slopes=none,
+        steps=none,
     )
+    index = jnp.arange(STEPS, dtype=jnp.int32)
+    return jax.lax.scan(step, (start, nothing), index)[0][1]

@@ -109,7 +109,5 @@ def names_of_leaves(like: Any, root: str) -> list[str]:
     """What each number of ``like``, arrays or their shapes, is called: its field with its place in
     an array, or ``root``.
     """
-    out = []
-    for path, s in jax.tree_util.tree_flatten_with_path(like)[0]:
-        out += [leaf_name(path, root) + entry for entry in entry_places(s.shape)]
-    return out
+    leaves, _ = jax.tree_util.tree_flatten_with_path(like)
+    return [leaf_name(path, root) + at for path, s in leaves for at in entry_places(s.shape)]

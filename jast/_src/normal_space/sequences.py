@@ -79,10 +79,7 @@ def log_ratio(steps, z):
         e = (z - m) / s
         return (jnp.log(s) - 0.5 * (z - e) * (z + e)).reshape(z.shape[0], -1).sum(axis=1)
 
-    parts = [
-        of(*each)
-        for each in zip(*map(jax.tree.leaves, (steps.mean, steps.deviation, z)), strict=True)
-    ]
+    parts = jax.tree.leaves(jax.tree.map(of, steps.mean, steps.deviation, z))
     dtype = max((p.dtype for p in parts), key=lambda t: t.itemsize)
     return sum((p.astype(dtype) for p in parts[1:]), parts[0].astype(dtype))
 
@@ -102,16 +99,11 @@ def fit(steps, z, counts, smoothing, floor):
         centre = jnp.sum(w * z, axis=0) / jnp.maximum(n, 1)
         spread = jnp.sqrt(jnp.sum(w * (z - centre[None]) ** 2, axis=0) / jnp.maximum(n, 1))
         kept = jnp.where(n >= 2, smoothing.astype(z.dtype), 1)
-        return kept * mean + (1 - kept) * centre, jnp.maximum(
-            kept * deviation + (1 - kept) * spread, floor.astype(z.dtype)
-        )
+        deviation = jnp.maximum(kept * deviation + (1 - kept) * spread, floor.astype(z.dtype))
+        return Steps(kept * mean + (1 - kept) * centre, deviation)
 
-    leaves, treedef = jax.tree.flatten(steps.mean)
-    fitted = [
-        one(*each)
-        for each in zip(leaves, jax.tree.leaves(steps.deviation), jax.tree.leaves(z), strict=True)
-    ]
-    return Steps(*(treedef.unflatten(part) for part in zip(*fitted, strict=True)))
+    fitted = jax.tree.map(one, steps.mean, steps.deviation, z)
+    return jax.tree.transpose(jax.tree.structure(steps.mean), None, fitted)
 
 
 def disturbance_at(actions, dist, z):
