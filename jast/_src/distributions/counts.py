@@ -62,13 +62,12 @@ class _Counts(Elementwise):
         """The number of which z is a normal number: from a table of where each begins, if
         `tables.serves`.
         """
-        if (
-            serves(self._known_numbers, z)
-            and (edges := _edges(type(self), self._known_numbers)) is not None
-        ):
-            first, ends = edges
-            return (first + jnp.searchsorted(ends, z)).astype(self.dtype)
-        return self._place(*log_tails(z))
+        known = self._known_numbers
+        edges = _edges(type(self), known) if serves(known, z) else None
+        if edges is None:
+            return self._place(*log_tails(z))
+        first, ends = edges
+        return (first + jnp.searchsorted(ends, z)).astype(self.dtype)
 
     def _guess(self, z):
         """About the number of z: Cornish and Fisher 1938, to the second term."""
@@ -298,12 +297,11 @@ class TiltedCounts(Tilted):
         return jnp.where(some, log_near + log_one_less(jnp.minimum(gap, 0)), -jnp.inf)
 
 
-for _kind in (Geometric, Poisson, Binomial):
-    register(
-        _kind,
-        quantile=lambda d, u: d._place(jnp.log(inside(u)), jnp.log1p(-inside(u))),
-        cdf=lambda d, x: jnp.exp(d.log_cell(x)[0]),
-        from_normal=lambda d, z: d._from_normal(z),
-        to_normal=lambda d, x: normal_of_log_tails(*d.log_cell(x)),
-        tilt=TiltedCounts,
-    )
+register(
+    _Counts,
+    quantile=lambda d, u: d._place(jnp.log(inside(u)), jnp.log1p(-inside(u))),
+    cdf=lambda d, x: jnp.exp(d.log_cell(x)[0]),
+    from_normal=lambda d, z: d._from_normal(z),
+    to_normal=lambda d, x: normal_of_log_tails(*d.log_cell(x)),
+    tilt=TiltedCounts,
+)

@@ -5,8 +5,7 @@ import jax.numpy as jnp
 from jax.scipy.special import expit, log_ndtr, logit
 
 from jast._src.distributions import continuous, discrete, operations
-from jast._src.distributions.family_table import register
-from jast._src.distributions.normal_rows import register_both
+from jast._src.distributions.family_table import register, register_both
 from jast._src.distributions.normal_tails import (
     cell,
     cells,
@@ -150,9 +149,8 @@ register_both(
 # distrax's Transformed, of numbers one by one
 
 
-def _check_elementwise(d, error):
-    if d.bijector.event_ndims_in != 0 or d.bijector.event_ndims_out != 0:
-        raise error
+def _elementwise(d):
+    return d.bijector.event_ndims_in == d.bijector.event_ndims_out == 0
 
 
 def _quartiles(d, like):
@@ -165,56 +163,48 @@ def _quartiles(d, like):
     )
 
 
-def _transformed(d, u):
-    _check_elementwise(d, operations.no_quantile(d))
-    x0, x1 = _quartiles(d, u)
-    return d.bijector.forward(operations.quantile(d.distribution, jnp.where(x1 >= x0, u, 1 - u)))
-
-
-def _inverse(d, x, name):
-    try:
-        return d.bijector.inverse(x)
-    except NotImplementedError:
-        raise ValueError(f"{name}: {type(d).__name__} has a bijector without inverse") from None
-
-
-def _cdf_transformed(d, x):
-    _check_elementwise(
-        d, ValueError(f"cdf: {type(d).__name__} has no quantile function here to invert")
-    )
-    x0, x1 = _quartiles(d, x)
-    u = operations.cdf(d.distribution, _inverse(d, x, "cdf"))
-    u = jnp.where(x1 >= x0, u, 1 - u)
-    within = (u > 0) & (u < 1)  # off the support the inverse may be NaN, or of either end
-    return jnp.where(within, u, (x >= (x0 + x1) / 2).astype(u.dtype))
-
-
 def _falls(d, like):
     x0, x1 = _quartiles(d, like)
     return x1 < x0
 
 
-def _transformed_of_normal(d, z):
-    """By the z of the base, which has the tails; a bijector that falls swaps them."""
-    _check_elementwise(d, operations.no_quantile(d))
-    return d.bijector.forward(
-        operations.from_normal(d.distribution, jnp.where(_falls(d, z), -z, z))
-    )
+def _forward(d, verb, at, opposite):
+    """The value at a number, by ``verb`` of the base, which has the tails: ``at`` this number, or
+    at its ``opposite`` where the bijector falls and swaps them.
+    """
+    if not _elementwise(d):
+        raise operations.no_quantile(d)
+    return d.bijector.forward(verb(d.distribution, jnp.where(_falls(d, at), opposite, at)))
+
+
+def _inverse(d, verb, x):
+    """The number of ``x``, by ``verb`` of the base."""
+    if not _elementwise(d):
+        raise ValueError(f"cdf: {type(d).__name__} has no quantile function here to invert")
+    try:
+        return verb(d.distribution, d.bijector.inverse(x))
+    except NotImplementedError:
+        raise ValueError(f"cdf: {type(d).__name__} has a bijector without inverse") from None
+
+
+def _cdf_transformed(d, x):
+    u = _inverse(d, operations.cdf, x)
+    x0, x1 = _quartiles(d, x)
+    u = jnp.where(x1 >= x0, u, 1 - u)
+    within = (u > 0) & (u < 1)  # off the support the inverse may be NaN, or of either end
+    return jnp.where(within, u, (x >= (x0 + x1) / 2).astype(u.dtype))
 
 
 def _normal_of_transformed(d, x):
-    _check_elementwise(
-        d, ValueError(f"cdf: {type(d).__name__} has no quantile function here to invert")
-    )
-    z = operations.to_normal(d.distribution, _inverse(d, x, "cdf"))
+    z = _inverse(d, operations.to_normal, x)
     return jnp.where(_falls(d, x), -z, z)
 
 
 register(
     "distrax:Transformed",
-    quantile=_transformed,
+    quantile=lambda d, u: _forward(d, operations.quantile, u, 1 - u),
     cdf=_cdf_transformed,
-    from_normal=_transformed_of_normal,
+    from_normal=lambda d, z: _forward(d, operations.from_normal, z, -z),
     to_normal=_normal_of_transformed,
     exact=lambda d: operations.has_exact_tails(d.distribution),
 )

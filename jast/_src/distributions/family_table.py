@@ -9,7 +9,7 @@ from collections.abc import Callable
 from functools import lru_cache
 from typing import Any, NamedTuple
 
-__all__ = ["register", "row"]
+__all__ = ["register", "register_both", "row"]
 
 
 class Row(NamedTuple):
@@ -80,6 +80,12 @@ def register(family: Any, **functions: Any) -> Any:
     _ROWS[family] = _ROWS.get(family, Row())._replace(**functions)
     _found.cache_clear()
     return family
+
+
+def register_both(kind: type, **functions: Callable[..., Any]) -> None:
+    """One row for jast's class ``kind`` and for distrax's of the same name."""
+    register(kind, **functions)
+    register(f"distrax:{kind.__name__}", **functions)
 
 
 def row(d: Any, *names: str) -> Row:

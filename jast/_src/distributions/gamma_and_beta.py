@@ -10,9 +10,10 @@ from jax.lax import lgamma
 from jax.scipy.special import betainc, betaln, digamma, gammainc, gammaincc, polygamma
 
 from jast._src.distributions import continuous
-from jast._src.distributions.normal_rows import register_both
+from jast._src.distributions.family_table import register_both
+from jast._src.distributions.log_tail_rows import of_inverse
 from jast._src.distributions.normal_tails import log_one_less, log_tails, normal_of_log_tails
-from jast._src.distributions.numerically_inverted import newton, row_of_inverse
+from jast._src.distributions.numerically_inverted import newton
 from jast._src.distributions.tables import interpolated, serves, tail
 
 __all__ = ["beta_tails", "gamma_tails"]
@@ -82,7 +83,7 @@ def _mode_of_gamma(d):
     return jnp.where(d.concentration < 1, d.mean(), d.mode())
 
 
-register_both(continuous.Gamma, mode=_mode_of_gamma, **row_of_inverse(_gamma, _tails_gamma))
+register_both(continuous.Gamma, mode=_mode_of_gamma, **of_inverse(_gamma, _tails_gamma))
 
 
 def beta_tails(a: jax.Array, b: jax.Array, y: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -156,4 +157,4 @@ def _mode_of_beta(d):
     return jnp.where((a < 1) | (b < 1) | ((a == 1) & (b == 1)), d.mean(), d.mode())
 
 
-register_both(continuous.Beta, mode=_mode_of_beta, **row_of_inverse(_beta, _tails_beta))
+register_both(continuous.Beta, mode=_mode_of_beta, **of_inverse(_beta, _tails_beta))

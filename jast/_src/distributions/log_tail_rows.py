@@ -9,10 +9,10 @@ import jax
 import jax.numpy as jnp
 
 from jast._src.distributions.family_table import row
-from jast._src.distributions.normal_tails import inside, log_tails, normal_of_log_tails
+from jast._src.distributions.normal_tails import inside, log_tails, ndtri, normal_of_log_tails
 from jast._src.distributions.operations import to_normal
 
-__all__ = ["log_tails_of", "of_log_tails"]
+__all__ = ["log_tails_of", "of_inverse", "of_log_tails"]
 
 
 def of_log_tails(place: Callable[..., Any], known: Callable[..., Any]) -> dict[str, Any]:
@@ -23,10 +23,22 @@ def of_log_tails(place: Callable[..., Any], known: Callable[..., Any]) -> dict[s
             it reads whichever is exact.
         known: (d, x) -> (log P(X <= x), log P(X > x)), its inverse.
     """
+    return of_inverse(lambda d, z: place(d, *log_tails(z)), known) | {
+        "quantile": lambda d, u: place(d, jnp.log(inside(u)), jnp.log1p(-inside(u)))
+    }
+
+
+def of_inverse(place: Callable[..., Any], known: Callable[..., Any]) -> dict[str, Any]:
+    """The functions of a row.
+
+    Args:
+        place: (d, z) -> the value.
+        known: (d, x) -> (log P(X <= x), log P(X > x)).
+    """
     return {
-        "quantile": lambda d, u: place(d, jnp.log(inside(u)), jnp.log1p(-inside(u))),
+        "quantile": lambda d, u: place(d, ndtri(inside(u))),
         "cdf": lambda d, x: jnp.exp(known(d, x)[0]),
-        "from_normal": lambda d, z: place(d, *log_tails(z)),
+        "from_normal": place,
         "to_normal": lambda d, x: normal_of_log_tails(*known(d, x)),
         "log_tails": known,
     }

@@ -10,18 +10,9 @@ from jax.scipy.linalg import solve_triangular
 
 from jast._src.distributions import containers, normal, operations, special
 from jast._src.distributions.base import tree_map
-from jast._src.distributions.family_table import register
+from jast._src.distributions.family_table import register, register_both
 from jast._src.distributions.normal_tails import inside, ndtr, ndtri, standard
 from jast._src.distributions.tilted import tilted
-
-__all__ = ["register_both"]
-
-
-def register_both(kind: type, **functions: Callable[..., Any]) -> None:
-    """One row for jast's class ``kind`` and for distrax's of the same name."""
-    register(kind, **functions)
-    register(f"distrax:{kind.__name__}", **functions)
-
 
 register_both(
     normal.Normal,
@@ -62,6 +53,14 @@ register_both(
 # the containers
 
 
+def _four_ways(of: Callable[..., Any]) -> dict[str, Callable[..., Any]]:
+    """The functions of a row between values, the unit interval and normal numbers: ``of`` the verb
+    that does it with a part.
+    """
+    names = "quantile", "cdf", "from_normal", "to_normal"
+    return {name: of(getattr(operations, name)) for name in names}
+
+
 def _summed(d, x):
     inner = operations.log_density(d.distribution, x, "mode")
     return inner.sum(range(inner.ndim - d.reinterpreted_batch_ndims, inner.ndim))
@@ -69,10 +68,7 @@ def _summed(d, x):
 
 register_both(
     containers.Independent,
-    quantile=lambda d, u: operations.quantile(d.distribution, u),
-    cdf=lambda d, x: operations.cdf(d.distribution, x),
-    from_normal=lambda d, z: operations.from_normal(d.distribution, z),
-    to_normal=lambda d, x: operations.to_normal(d.distribution, x),
+    **_four_ways(lambda verb: lambda d, value: verb(d.distribution, value)),
     mode=lambda d: operations.mode(d.distribution),
     log_prob_from_mode=_summed,
     tilt=lambda d, m, s: containers.Independent(
@@ -88,10 +84,7 @@ def _each(verb: Callable[..., Any]) -> Callable[..., Any]:
 
 register_both(
     containers.Joint,
-    quantile=_each(operations.quantile),
-    cdf=_each(operations.cdf),
-    from_normal=_each(operations.from_normal),
-    to_normal=_each(operations.to_normal),
+    **_four_ways(_each),
     mode=_each(operations.mode),
     log_mode=lambda d: operations.sum_parts(_each(operations.log_mode)(d)),
     log_prob_from_mode=lambda d, x: operations.sum_parts(
@@ -108,19 +101,13 @@ def _either(verb: Callable[..., Any]) -> Callable[..., Any]:
 
 register(
     special.Where,
-    quantile=_either(operations.quantile),
-    cdf=_either(operations.cdf),
-    from_normal=_either(operations.from_normal),
-    to_normal=_either(operations.to_normal),
+    **_four_ways(_either),
     tilt=lambda d, m, s: special.Where(d.pred, *(tilted(part, m, s) for part in d.parts)),
     exact=lambda d: all(operations.has_exact_tails(part) for part in d.parts),
 )
 
 register(
     special.Fixed,
-    quantile=lambda d, u: (),
-    cdf=lambda d, x: (),
-    from_normal=lambda d, z: (),
-    to_normal=lambda d, x: (),
+    **_four_ways(lambda verb: lambda d, value: ()),
     tilt=lambda d, m, s: d,
 )

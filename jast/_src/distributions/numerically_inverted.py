@@ -18,20 +18,14 @@ from jax.scipy.special import betainc, erfinv
 
 from jast._src.core.typing import Array, Numeric, PRNGKey
 from jast._src.distributions.base import Distribution, broadcast, float_array
-from jast._src.distributions.family_table import register
-from jast._src.distributions.log_tail_rows import log_tails_of
+from jast._src.distributions.family_table import register, register_both
+from jast._src.distributions.log_tail_rows import log_tails_of, of_inverse
 from jast._src.distributions.normal import Symmetric
-from jast._src.distributions.normal_tails import (
-    HALF_LOG_2PI,
-    inside,
-    log_tails,
-    ndtri,
-    normal_of_log_tails,
-)
+from jast._src.distributions.normal_tails import HALF_LOG_2PI, log_tails, normal_of_log_tails
 from jast._src.distributions.operations import from_normal
 from jast._src.distributions.tables import interpolated, numbers, serves, tail
 
-__all__ = ["MixtureSameFamily", "StudentT", "newton", "row_of_inverse"]
+__all__ = ["MixtureSameFamily", "StudentT", "newton"]
 
 
 MAX_STEPS = 64
@@ -109,22 +103,6 @@ def _instantiated(tangent):
 
 
 _newton.defjvp(_newton_jvp, symbolic_zeros=True)
-
-
-def row_of_inverse(place: Callable[..., Any], known: Callable[..., Any]) -> dict[str, Any]:
-    """The functions of a row.
-
-    Args:
-        place: (d, z) -> the value.
-        known: (d, x) -> (log P(X <= x), log P(X > x)).
-    """
-    return {
-        "quantile": lambda d, u: place(d, ndtri(inside(u))),
-        "cdf": lambda d, x: jnp.exp(known(d, x)[0]),
-        "from_normal": place,
-        "to_normal": lambda d, x: normal_of_log_tails(*known(d, x)),
-        "log_tails": known,
-    }
 
 
 # Student's t: solved in y = asinh of the standardised value
@@ -210,7 +188,7 @@ def _tails_student(d, x):
     return log_tails(jnp.sign(t) * _score_t(d.df, t))
 
 
-register(StudentT, **row_of_inverse(_student, _tails_student))
+register(StudentT, **of_inverse(_student, _tails_student))
 
 
 # mixtures: the root lies between the values of the parts
@@ -291,5 +269,4 @@ def _mixture(d, z):
     return newton(_score_mixture, type(d).log_prob, d, z, guess, low, high)
 
 
-register(MixtureSameFamily, **row_of_inverse(_mixture, _tails_mixture))
-register("distrax:MixtureSameFamily", **row_of_inverse(_mixture, _tails_mixture))
+register_both(MixtureSameFamily, **of_inverse(_mixture, _tails_mixture))

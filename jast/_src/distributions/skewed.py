@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jast._src.core.typing import Array, ArrayTree, Numeric, PRNGKey
 from jast._src.distributions.base import Elementwise, broadcast, float_array
 from jast._src.distributions.continuous import log_power
-from jast._src.distributions.family_table import register
+from jast._src.distributions.family_table import register, register_both
 from jast._src.distributions.log_tail_rows import of_log_tails
 from jast._src.distributions.normal import LocationScale
 from jast._src.distributions.normal_tails import (
@@ -131,11 +131,10 @@ def _tails_gumbel(d, x):
     return below, log_one_less(below)
 
 
-for _kind in (Gumbel, "distrax:Gumbel"):
-    register(
-        _kind,
-        **of_log_tails(lambda d, below, above: d.loc - d.scale * jnp.log(-below), _tails_gumbel),
-    )
+register_both(
+    Gumbel,
+    **of_log_tails(lambda d, below, above: d.loc - d.scale * jnp.log(-below), _tails_gumbel),
+)
 
 
 class Weibull(Elementwise):
