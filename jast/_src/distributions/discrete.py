@@ -34,6 +34,10 @@ class _Choice(Distribution):
         self._dtype = dtype
 
     @property
+    def _given(self):
+        return self._probs if self._logits is None else self._logits
+
+    @property
     def dtype(self) -> Any:
         return jax.dtypes.canonicalize_dtype(self._dtype)
 
@@ -61,7 +65,7 @@ class Bernoulli(_Choice):
 
     @property
     def batch_shape(self) -> tuple[int, ...]:
-        return (self._probs if self._logits is None else self._logits).shape
+        return self._given.shape
 
     @property
     def probs(self) -> jax.Array:
@@ -120,7 +124,7 @@ class Categorical(_Choice):
 
     @property
     def batch_shape(self) -> tuple[int, ...]:
-        return (self._probs if self._logits is None else self._logits).shape[:-1]
+        return self._given.shape[:-1]
 
     @property
     def probs(self) -> jax.Array:
@@ -132,7 +136,7 @@ class Categorical(_Choice):
 
     @property
     def num_categories(self) -> int:
-        return (self._probs if self._logits is None else self._logits).shape[-1]
+        return self._given.shape[-1]
 
     def _sample_n(self, key: PRNGKey, n: int) -> Any:
         logits, p = self.logits, self.probs
@@ -148,8 +152,7 @@ class Categorical(_Choice):
         return jnp.where(outside, -jnp.inf, jnp.sum(_times(logits, chosen), axis=-1))
 
     def mode(self) -> Any:
-        numbers = self._probs if self._logits is None else self._logits
-        return jnp.argmax(numbers, axis=-1).astype(self._dtype)
+        return jnp.argmax(self._given, axis=-1).astype(self._dtype)
 
 
 def _times(x, y):

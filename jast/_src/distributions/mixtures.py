@@ -5,7 +5,7 @@ defensive mixing), and of one distribution moved in its latent normal numbers.
 import jax
 import jax.numpy as jnp
 
-from jast._src.distributions.base import Distribution
+from jast._src.distributions.base import Distribution, Wrapped
 from jast._src.distributions.flat_rows import unflat
 from jast._src.distributions.operations import event_like, from_normal, mode, sample
 from jast._src.distributions.tilted import tilted
@@ -26,9 +26,6 @@ class _Mixture(Distribution):
                 " over keys"
             )
         return self._draw(seed)
-
-    def _sample_n(self, key, n):
-        return jax.vmap(self._draw)(jax.random.split(key, n))
 
 
 class Blend(_Mixture):
@@ -82,31 +79,24 @@ def x_of(dist, z):
     return from_normal(dist, unflat(z, event_like(dist)))
 
 
-class Moved(Distribution):
+class Moved(Wrapped):
     """``dist`` with its latents z ~ N(mean, deviation^2), [n] each; the ``mode`` is the value at z
     = mean, the deterministic policy's.
     """
 
     def __init__(self, dist, mean, deviation):
         like = event_like(dist)
-        self.mean_z, self.deviation_z, self.model = mean, deviation, dist
-        self._inner = tilted(dist, unflat(mean, like), unflat(deviation, like))
-
-    @property
-    def event_shape(self):
-        return self._inner.event_shape
+        super().__init__(tilted(dist, unflat(mean, like), unflat(deviation, like)))
+        self._model, self._mean = dist, mean
 
     def sample(self, *, seed, sample_shape=()):
-        return self._inner.sample(seed=seed, sample_shape=sample_shape)
-
-    def _sample_n(self, key, n):
-        return self.sample(seed=key, sample_shape=(n,))
+        return self._distribution.sample(seed=seed, sample_shape=sample_shape)
 
     def log_prob(self, value):
-        return self._inner.log_prob(value)
+        return self._distribution.log_prob(value)
 
     def mode(self):
-        return x_of(self.model, self.mean_z)
+        return x_of(self._model, self._mean)
 
 
 class Blended(_Mixture):

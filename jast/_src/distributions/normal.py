@@ -55,11 +55,7 @@ class Symmetric(LocationScale):
     def mean(self) -> Any:
         return self.loc
 
-    def median(self) -> Any:
-        return self.loc
-
-    def mode(self) -> Any:
-        return self.loc
+    median = mode = mean
 
 
 class Normal(Symmetric):
@@ -120,11 +116,7 @@ class _Vector(Distribution):
     def mean(self) -> Any:
         return self.loc
 
-    def median(self) -> Any:
-        return self.loc
-
-    def mode(self) -> Any:
-        return self.loc
+    median = mode = mean
 
     def stddev(self) -> Any:
         return jnp.sqrt(self.variance())
@@ -146,8 +138,7 @@ class MultivariateNormalDiag(_Vector):
     """
 
     def __init__(self, loc: Any = None, scale_diag: Any = None) -> None:
-        loc, scale = _given("MultivariateNormalDiag", loc=loc, scale_diag=scale_diag)
-        _vectors("MultivariateNormalDiag", "scale_diag", loc, scale, 1)
+        loc, scale = _fitting("MultivariateNormalDiag", "scale_diag", loc, scale_diag, 1)
         if scale is None:
             scale = jnp.ones(loc.shape[-1], loc.dtype)
         if loc is None:
@@ -197,8 +188,7 @@ class MultivariateNormalTri(_Vector):
     """
 
     def __init__(self, loc: Any = None, scale_tri: Any = None, is_lower: bool = True) -> None:
-        loc, scale = _given("MultivariateNormalTri", loc=loc, scale_tri=scale_tri)
-        _vectors("MultivariateNormalTri", "scale_tri", loc, scale, 2)
+        loc, scale = _fitting("MultivariateNormalTri", "scale_tri", loc, scale_tri, 2)
         dtype = jnp.result_type(*(a for a in (loc, scale) if a is not None))
         k = (scale if loc is None else loc).shape[-1]
         self._loc = jnp.zeros((k,), dtype) if loc is None else loc
@@ -243,13 +233,13 @@ class MultivariateNormalTri(_Vector):
         return self.scale_tri @ jnp.swapaxes(self.scale_tri, -1, -2)
 
 
-def _given(kind: str, **values: Any) -> list[Any]:
-    if all(v is None for v in values.values()):
-        raise ValueError(f"{kind}: expected {' or '.join(values)}, received neither")
-    return [None if v is None else float_array(v) for v in values.values()]
-
-
-def _vectors(kind: str, name: str, loc: Any, scale: Any, ndim: int) -> None:
+def _fitting(kind: str, name: str, loc: Any, scale: Any, ndim: int) -> tuple[Any, Any]:
+    """``loc`` and the ``scale`` of that name, of ``ndim`` axes or more, as arrays of floats; None
+    stays None.
+    """
+    if loc is None and scale is None:
+        raise ValueError(f"{kind}: expected loc or {name}, received neither")
+    loc, scale = (None if v is None else float_array(v) for v in (loc, scale))
     if loc is not None and loc.ndim < 1:
         raise ValueError(f"{kind}: loc: expected a vector, received a scalar")
     if scale is not None and scale.ndim < ndim:
@@ -259,3 +249,4 @@ def _vectors(kind: str, name: str, loc: Any, scale: Any, ndim: int) -> None:
     if len(sizes) > 1:
         shapes = f"{getattr(loc, 'shape', None)} and {getattr(scale, 'shape', None)}"
         raise ValueError(f"{kind}: loc and {name} do not fit: received shapes {shapes}")
+    return loc, scale

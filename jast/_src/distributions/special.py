@@ -18,7 +18,16 @@ from jast._src.distributions.operations import log_density, mode
 __all__ = ["Deterministic", "Fixed", "Seeds", "Tent", "Where", "seeds", "tent", "where"]
 
 
-class Fixed(Distribution):
+class _WithoutDensity(Distribution):
+    """Of log density 0 everywhere, as there is none."""
+
+    def log_prob(self, value: Any) -> Array:
+        return jnp.zeros(())
+
+    log_prob_from_mode = log_prob
+
+
+class Fixed(_WithoutDensity):
     """The certain, empty disturbance ``()``: a system with one start.
 
     Example:
@@ -38,16 +47,11 @@ class Fixed(Distribution):
     def _sample_n(self, key: PRNGKey, n: int) -> Any:
         return ()
 
-    def log_prob(self, value: Any) -> Array:
-        return jnp.zeros(())
-
-    log_prob_from_mode = log_prob
-
     def mode(self) -> Any:
         return ()
 
 
-class Deterministic(Distribution):
+class Deterministic(_WithoutDensity):
     """All mass on ``value``, a pytree of arrays: a recorded disturbance. ``log_prob`` is 0: it is a
     point, not a density.
 
@@ -74,16 +78,11 @@ class Deterministic(Distribution):
     def _sample_n(self, key: PRNGKey, n: int) -> Any:
         return jax.tree.map(lambda a: jnp.broadcast_to(a, (n, *a.shape)), self._value)
 
-    def log_prob(self, value: Any) -> Array:
-        return jnp.zeros(())
-
-    log_prob_from_mode = log_prob
-
     def mode(self) -> Any:
         return self._value
 
 
-class Seeds(Distribution):
+class Seeds(_WithoutDensity):
     """Random seeds of ``shape``, uint32, for a system whose disturbance density is unknown:
     ``log_prob`` is 0 and there is no mode.
 
@@ -103,11 +102,6 @@ class Seeds(Distribution):
 
     def _sample_n(self, key: PRNGKey, n: int) -> Any:
         return jax.random.bits(key, (n, *self._shape), jnp.uint32)
-
-    def log_prob(self, value: Any) -> Array:
-        return jnp.zeros(())
-
-    log_prob_from_mode = log_prob
 
 
 class Tent(Distribution):
@@ -222,9 +216,6 @@ class Where(Distribution):
         # reused keys that it is meant
         other = self._b.sample(seed=jax.random.clone(seed), sample_shape=sample_shape)
         return self.select(self._a.sample(seed=seed, sample_shape=sample_shape), other)
-
-    def _sample_n(self, key: PRNGKey, n: int) -> Any:
-        return self.sample(seed=key, sample_shape=(n,))
 
     def log_prob(self, value: Any) -> Array:
         return self.select(self._a.log_prob(value), self._b.log_prob(value))

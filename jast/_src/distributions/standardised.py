@@ -1,12 +1,13 @@
 """How far out a value is, in standard deviations of a normal number; how probable a choice is."""
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 
-from jast._src.distributions.base import is_distribution
+from jast._src.distributions.base import tree_map
 from jast._src.distributions.operations import has_mode, mode, to_normal
 
 __all__ = ["chances", "spread"]
@@ -29,9 +30,7 @@ def _of_each_part(of: Callable, d: Any, x: Any) -> Any:
     """``of`` each independent part of ``d`` and its value."""
     if not hasattr(d, "distributions"):
         return of(d, x)
-    each, treedef = jax.tree.flatten(d.distributions, is_leaf=is_distribution)
-    values = treedef.flatten_up_to(x)
-    return treedef.unflatten([_of_each_part(of, a, b) for a, b in zip(each, values, strict=True)])
+    return tree_map(partial(_of_each_part, of), d.distributions, x)
 
 
 def _without_independent(d: Any) -> Any:
