@@ -184,9 +184,8 @@ class Route:
         with ONE:
             flight = judged(*fly(np.asarray(self.rows, np.float64)))
         least = self.tolerance * (FLOOR if flight.finished else 1.0)
-        self.distance = float(
-            np.log(self.tolerance / max(least, *(flight.nearest - flight.allowed)))
-        )
+        greatest = max(least, *(flight.nearest - flight.allowed))
+        self.distance = float(np.log(self.tolerance / greatest))
 
     def is_event(self):
         return self.distance <= 0
@@ -213,12 +212,8 @@ def fly(x):
     """
     bs = started()
     course, length = np.radians(x[:, 0]), np.maximum(x[:, 1], LEAST)
-    route = np.concatenate(
-        [
-            np.zeros((1, 2)),
-            np.cumsum(length[:, None] * np.stack([np.cos(course), np.sin(course)], 1), 0),
-        ]
-    )
+    legs = length[:, None] * np.stack([np.cos(course), np.sin(course)], 1)
+    route = np.concatenate([np.zeros((1, 2)), np.cumsum(legs, 0)])
     bs.sim.reset()
     bs.traf.cre("JAST", "A320", 0.0, 0.0, float(x[0, 0]) % 360, ALTITUDE, CAS)
     bs.stack.stack("DT 1")

@@ -76,11 +76,10 @@ def ferry(
         start = jnp.zeros(())
     if start.shape != (2,):
         raise ValueError(f"ferry: adversary must be two numbers (x, y), received {adversary!r}")
-    adversary = start
-    if not jnp.issubdtype(adversary.dtype, jnp.floating):
-        adversary = adversary.astype(jnp.zeros(()).dtype)
+    if not jnp.issubdtype(start.dtype, jnp.floating):
+        start = start.astype(jnp.zeros(()).dtype)
     return Simulator(
-        init=Partial(_init, adversary),
+        init=Partial(_init, start),
         step=_step,
         disturbance=_disturbance,
         evaluate=_evaluate,

@@ -62,14 +62,13 @@ def pendulum(
     noise, sigma_theta, sigma_omega, limit = positive(
         "pendulum", noise=noise, sigma_theta=sigma_theta, sigma_omega=sigma_omega, limit=limit
     )
-    start = Partial(_start, jnp.stack([sigma_theta, sigma_omega]))
     return Simulator(
         init=_init,
         step=_step,
         disturbance=Partial(_disturbance, noise),
         evaluate=Partial(_evaluate, limit),
         horizon=STEPS,
-        start=start,
+        start=Partial(_start, jnp.stack([sigma_theta, sigma_omega])),
     )
 
 

@@ -126,9 +126,8 @@ def _drive_first(cars: Cars, inputs: jax.Array) -> tuple[_Path, tuple[Any, Any]]
         return after, (law, after)
 
     begin = cars.speeds[0], cars.first
-    first = cars.first
     _, (laws, after) = lax.scan(body, begin, (inputs[:, 0], inputs[:, 1]))
-    never, zero = (jnp.full(len(inputs), v, first.dtype) for v in (jnp.inf, 0))
+    never, zero = (jnp.full(len(inputs), v, cars.first.dtype) for v in (jnp.inf, 0))
     return _Path(laws, never, laws, zero), after
 
 
@@ -148,15 +147,16 @@ def _drive_follower(at: tuple[Any, Any, Any], ahead: _Path) -> tuple[Any, Any]:
     up, down = up.astype(gap.dtype), down.astype(gap.dtype)
 
     # the gap has a kink where the car ahead switches: it may be past a level there alone
-    kink = jnp.minimum(ahead.switch, jnp.asarray(DT, gap.dtype))
-    sides = free(kink), free(jnp.asarray(DT, gap.dtype))
+    end = jnp.asarray(DT, gap.dtype)
+    kink = jnp.minimum(ahead.switch, end)
+    sides = free(kink), free(end)
     early = (sides[0] >= up) | (sides[0] <= down)
     high = jnp.where(early, sides[0], sides[1]) >= up
     switches = early | high | (sides[1] <= down)
     level = jnp.where(switches, jnp.where(high, up, down), 0)
     sign = jnp.where(high, 1, -1).astype(gap.dtype)
     left = jnp.where(early, jnp.zeros_like(kink), kink)
-    right = jnp.where(early, kink, jnp.asarray(DT, gap.dtype))
+    right = jnp.where(early, kink, end)
 
     def over(t: Any) -> Any:
         """At least 0 from the switch on."""
@@ -175,7 +175,6 @@ def _drive_follower(at: tuple[Any, Any, Any], ahead: _Path) -> tuple[Any, Any]:
     path = _Path(law, jnp.where(switches, when, jnp.inf), later, _distance(law, when))
     mode = jnp.where(switches, new, mode)
     last = jnp.where(switches, _speed(later, DT - when), _speed(law, DT))
-    end = jnp.asarray(DT, gap.dtype)
     after = gap + _distance_gone(path, end) - _distance_gone(ahead, end), jnp.abs(last), mode
     return after, (path, after)
 

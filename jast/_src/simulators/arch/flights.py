@@ -75,7 +75,7 @@ def ground_collision_avoidance(
         is_terminal=ends(needed),
         observe=_observe,
     )
-    return under(sim, formula, gcas.DT, samples=Partial(samples_of))
+    return under(sim, formula, gcas.DT, samples=samples_of)
 
 
 def fly(

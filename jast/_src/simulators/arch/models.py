@@ -10,7 +10,6 @@ from typing import Any, Literal, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.tree_util import Partial
 
 from jast._src.core.simulator import Simulator
 from jast._src.core.typing import Array
@@ -208,38 +207,39 @@ def _driven(
     formula = named(function, prefix, requirement)
     each = total // segments
     needed = min(reach(formula, model.DT), total)
-    functions, samples = _functions(model, each, math.ceil(needed / each))
+    functions = _functions(model, each, math.ceil(needed / each))
     if disturbance is not None:
         functions = functions | dict(disturbance=lambda state: disturbance)
-    return under(Simulator(**functions, horizon=segments), formula, model.DT, samples=samples)
+    return under(Simulator(**functions, horizon=segments), formula, model.DT, samples=samples_of)
 
 
 @cache
-def _functions(model: ModuleType, each: int, needed: int) -> tuple[dict[str, Any], Any]:
-    """The functions of a simulator whose steps are ``each`` samples of a model, ``needed`` of them,
-    and what says its samples: the same objects for the same numbers, so that nothing compiles anew.
+def _functions(model: ModuleType, each: int, needed: int) -> dict[str, Any]:
+    """The functions of a simulator whose steps are ``each`` samples of a model, ``needed`` of them:
+    the same objects for the same numbers, so that nothing compiles anew.
     """
+
+    def real(a: Any) -> Any:
+        return jnp.asarray(a, jnp.zeros(()).dtype)
 
     def init(x0: Any) -> Driving:
         return begun(model.start(), each)
 
     def ranges() -> list[Any]:
-        dtype = jnp.zeros(()).dtype
-        return [jnp.array([i[side] for i in model.INPUTS], dtype) for side in (1, 2)]
+        return [real([i[side] for i in model.INPUTS]) for side in (1, 2)]
 
     def disturbance(state: Driving) -> Any:
         return Independent(Uniform(*ranges()), 1)
 
     def step(state: Driving, x: Any) -> Driving:
-        inputs = jnp.broadcast_to(jnp.clip(x, *ranges()).astype(jnp.zeros(()).dtype), (each, 2))
+        inputs = jnp.broadcast_to(real(jnp.clip(x, *ranges())), (each, 2))
         return Driving(*model.drive(state.now, inputs), state.step + 1)
 
     def observe(state: Driving) -> Any:
-        dtype = jnp.zeros(()).dtype
         parts = *model.observe(state.now), state.step[None]
-        return jnp.concatenate([part.astype(dtype) for part in parts])
+        return jnp.concatenate([real(part) for part in parts])
 
-    functions = dict(
+    return dict(
         init=init,
         step=step,
         disturbance=disturbance,
@@ -247,7 +247,6 @@ def _functions(model: ModuleType, each: int, needed: int) -> tuple[dict[str, Any
         is_terminal=ends(needed),
         observe=observe,
     )
-    return functions, Partial(samples_of)
 
 
 def begun(now: Any, each: int) -> Driving:

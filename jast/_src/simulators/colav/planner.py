@@ -63,10 +63,8 @@ def costs(along, obstacle):
     with this `tracker.Track`.
     """
     dtype = along.dtype
-    speeds, times = (
-        jnp.asarray(SPEEDS, dtype)[:, None],
-        jnp.arange(STEP, AHEAD + STEP, STEP, dtype=dtype)[None, :],
-    )
+    speeds = jnp.asarray(SPEEDS, dtype)[:, None]
+    times = jnp.arange(STEP, AHEAD + STEP, STEP, dtype=dtype)[None, :]
     n, e, v_n, v_e = obstacle
     speed = jnp.sqrt(v_n**2 + v_e**2)
     still = speed < STILL  # a course of its own an obstacle at rest has not
@@ -86,11 +84,8 @@ def plan(along, current, obstacle):
     """int32: which of `SPEEDS` to take now; ``current``: the one in force."""
     cost = costs(along, obstacle)
     now, least = _pick(cost, current), jnp.min(cost)
-    return jnp.where(
-        (least < KEEP * now) & (least < now - KEEP_LEAST),
-        jnp.argmin(cost).astype(jnp.int32),
-        current,
-    )
+    better = (least < KEEP * now) & (least < now - KEEP_LEAST)
+    return jnp.where(better, jnp.argmin(cost).astype(jnp.int32), current)
 
 
 def speed_of(choice, dtype):

@@ -191,16 +191,11 @@ def _kinds(disturbances):
 def _settled(scenario, dtype):
     """The scenario as arrays, or a ValueError that says what is wrong with it."""
     if isinstance(scenario, str):
-        if scenario not in SCENARIOS:
-            raise ValueError(
-                f"colav: scenario must be one of {list(SCENARIOS)} or a Scenario, received"
-                f" {scenario!r}"
-            )
-        scenario = SCENARIOS[scenario]
+        scenario = SCENARIOS.get(scenario, scenario)
     if not isinstance(scenario, Scenario):
+        received = repr(scenario) if isinstance(scenario, str) else type(scenario).__name__
         raise ValueError(
-            f"colav: scenario must be one of {list(SCENARIOS)} or a Scenario, received"
-            f" {type(scenario).__name__}"
+            f"colav: scenario must be one of {list(SCENARIOS)} or a Scenario, received {received}"
         )
     shapes = dict(
         adversary="three numbers (north, east, heading)",
@@ -229,10 +224,8 @@ def _settled(scenario, dtype):
 def _init(model, x0):
     start = model.scenario
     zero = jnp.zeros((), start.route.dtype)
-    pose, adversary = (
-        Pose(*start.ferry),
-        Adversary(Pose(*start.adversary), Velocity(start.route[0, 0], start.route[0, 1], zero)),
-    )
+    pose, (surge, sway, _) = Pose(*start.ferry), start.route[0]
+    adversary = Adversary(Pose(*start.adversary), Velocity(surge, sway, zero))
     now = _seen(adversary)
     return ColavState(
         pose=pose,
@@ -257,21 +250,17 @@ def _disturbance(model, s):
             return D.tent(s.steering, model.swing)
         return D.MultivariateNormalDiag(jnp.zeros(4, s.delay.dtype), model.noise)
 
-    return (
-        of(model.kinds[0])
-        if len(model.kinds) == 1
-        else D.Joint({kind: of(kind) for kind in model.kinds})
-    )
+    if len(model.kinds) == 1:
+        return of(model.kinds[0])
+    return D.Joint({kind: of(kind) for kind in model.kinds})
 
 
 def _step(model, s, x):
     x = {model.kinds[0]: x} if len(model.kinds) == 1 else x
     dtype, n = s.near.dtype, model.substeps
     zero = jnp.zeros((), dtype)
-    delay, steering = (
-        jnp.clip(x.get("delay", zero), 0, 1),
-        jnp.clip(x.get("steering", s.steering), 0, 1),
-    )
+    delay = jnp.clip(x.get("delay", zero), 0, 1)
+    steering = jnp.clip(x.get("steering", s.steering), 0, 1)
     noise = Track(*x.get("noise", jnp.zeros(4, dtype)))
     dt = PERIOD / n
 

@@ -60,9 +60,9 @@ def reader(past, step, delay):
         a, b, c, d = (jnp.where(later, q, p) for p, q in zip(one, two, strict=True))
         t = time - later.astype(time.dtype)
         place, speed = ((a * t + b) * t + c) * t + d, (3 * a * t + 2 * b) * t + c
-        return place[0], place[1], speed[0] / PERIOD, speed[1] / PERIOD
+        return Track(place[0], place[1], speed[0] / PERIOD, speed[1] / PERIOD)
 
-    return lambda since: Track(*read(since))
+    return read
 
 
 def track(before, seen, dt):

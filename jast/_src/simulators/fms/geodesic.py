@@ -63,7 +63,7 @@ def direct(earth, point, course, distance):
     latitude = jnp.arctan2(sin_2, (1 - f) * jnp.hypot(equator, ahead))
     omega = jnp.arctan2(sin_s * sin_a, cos_1 * cos_s - sin_1 * sin_s * cos_a)
     longitude = point[..., 1] + jnp.degrees(omega - f * equator * _longitude(f, k2, sigma_1, sigma))
-    return jnp.stack([jnp.degrees(latitude), _turn(longitude)], -1), jnp.arctan2(equator, ahead)
+    return jnp.stack([jnp.degrees(latitude), wrap(longitude, 360)], -1), jnp.arctan2(equator, ahead)
 
 
 @jax.jit
@@ -78,7 +78,7 @@ def inverse(earth, start, end):
     sin_1, cos_1 = _reduced(f, start[..., 0])
     sin_2, cos_2 = _reduced(f, end[..., 0])
     rise = sin_2 * cos_1 - cos_2 * sin_1  # sine of the difference of the latitudes
-    difference = jnp.radians(_turn(end[..., 1] - start[..., 1]))
+    difference = jnp.radians(wrap(end[..., 1] - start[..., 1], 360))
 
     def sphere(omega):
         """Of a difference of longitudes on the auxiliary sphere: the arc, its start, the sine of
@@ -89,18 +89,10 @@ def inverse(earth, start, end):
         sin_s = jnp.hypot(east, north)
         cos_s = sin_1 * sin_2 + cos_1 * cos_2 * (1 - bend)
         equator = cos_1 * east / jnp.maximum(sin_s, 1e-300)
-        first, last = (
-            jnp.arctan2(east, north),
-            jnp.arctan2(cos_1 * sin_o, rise - sin_2 * cos_1 * bend),
-        )
-        return (
-            jnp.arctan2(sin_s, cos_s),
-            jnp.arctan2(sin_1 * sin_s, north * cos_1),
-            equator,
-            _k2(f, equator),
-            first,
-            last,
-        )
+        sigma, sigma_1 = jnp.arctan2(sin_s, cos_s), jnp.arctan2(sin_1 * sin_s, north * cos_1)
+        first = jnp.arctan2(east, north)
+        last = jnp.arctan2(cos_1 * sin_o, rise - sin_2 * cos_1 * bend)
+        return sigma, sigma_1, equator, _k2(f, equator), first, last
 
     def body(_, omega):
         sigma, sigma_1, equator, k2, *_ = sphere(omega)
@@ -110,13 +102,11 @@ def inverse(earth, start, end):
     return earth.radius * (1 - f) * _distance(k2, sigma_1, sigma), first, last
 
 
-def wrap(angle):
-    """Radians in [-pi, pi]; what is there already is left as it is."""
-    return angle - 2 * jnp.pi * jnp.round(angle / (2 * jnp.pi))
-
-
-def _turn(degrees):
-    return degrees - 360 * jnp.round(degrees / 360)
+def wrap(angle, turn=2 * jnp.pi):
+    """Radians in [-pi, pi], or within half of another whole ``turn``; what is there already is left
+    as it is.
+    """
+    return angle - turn * jnp.round(angle / turn)
 
 
 def _reduced(f, latitude):

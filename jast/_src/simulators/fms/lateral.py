@@ -116,10 +116,9 @@ def lateral(build, waypoints, winds, count):
     overlap = both(lead) > legs
 
     at = jnp.stack([waypoints[1:-1]] * 2)
-    points, courses = direct(
+    (start, finish), (course_in, course_out) = direct(
         build.earth, at, jnp.stack([arriving[:-1], out]), jnp.stack([-lead, lead])
     )
-    (start, finish), (course_in, course_out) = points, courses
     side = jnp.where(turn < 0, -1, 1).astype(turn.dtype)
     centre, _ = direct(build.earth, start, course_in + side * jnp.pi / 2, radius)
     start = jnp.where(
