@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import jast
-from benchmarks import arch_flights
-from jast._src.simulators.arch import f16, f16_design, gcas
+from benchmarks import arch_flights, f16_design
+from jast._src.simulators.arch import f16, gcas
 from jast.distributions import Independent, Normal
 from jast.simulators.arch import SPECIFICATIONS, fly
 from jast.simulators.arch import ground_collision_avoidance as avoidance

@@ -18,7 +18,7 @@ Pull   5 g more than level flight's load             Wait, after 2 s and when it
 The numbers are the benchmark's. What leads from Wait to Roll and from Pull to Wait is our reading,
 as are the throttle, which stays at level flight's, and surfaces that move at once, up to 25, 21.5
 and 30 degrees. **The gains of the inner loops are our own design**
-(`simulators.arch.f16_design`), as the published ones are under the GPL. So figures compare
+(`benchmarks.f16_design`), as the published ones are under the GPL. So figures compare
 with published ones in kind alone, and starts that are hard to survive are lower: from 2338 ft, as
 in the category of 2024, no flight of this model comes below 47 ft, where 1.3 % of all starts fail
 with the published gains, by up to 34 ft. From 2262 ft 1.2 % fail here, by up to 28 ft.
@@ -56,7 +56,7 @@ LIMITS = 25.0, 21.5, 30.0  # degrees
 STAGES = np.array([[0, 1 / 6], [0.5, 1 / 3], [0.5, 1 / 3], [1, 1 / 6]])
 """Of Runge-Kutta's method: how far along the last slope each is, and its weight."""
 
-# jast._src.simulators.arch.f16_design: level flight at 502 ft/s, and the gains about it
+# benchmarks.f16_design: level flight at 502 ft/s, and the gains about it
 LEVEL_ALPHA = 0.0369109
 THROTTLE = 0.138535
 ELEVATOR = -0.758780

@@ -3,7 +3,7 @@ about level flight at 502 ft/s and sea level.
 
 The loops are those of Heidlauf, Collins, Bolender and Bak (2018), Verification challenges in F-16
 ground collision avoidance and other automated maneuvers. Their gains are not used: these are a
-design of our own, with the weights below. `simulators.arch.gcas` has the result, so that
+design of our own, with the weights below. `jast._src.simulators.arch.gcas` has the result, so that
 nothing is designed when it is imported.
 """
 
