@@ -209,6 +209,10 @@ class Elementwise(Distribution):
     def batch_shape(self) -> tuple[int, ...]:
         return jax.lax.broadcast_shapes(*(getattr(self, name).shape for name in self._parameters))
 
+    @property
+    def dtype(self) -> Any:
+        return jnp.result_type(*(getattr(self, name) for name in self._parameters))
+
 
 def broadcast(name: str) -> Any:
     """A property of an `Elementwise`: the parameter ``name``, broadcast with the others."""

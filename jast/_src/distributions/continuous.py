@@ -93,10 +93,6 @@ class Uniform(Elementwise):
     def range(self) -> jax.Array:
         return self.high - self.low
 
-    @property
-    def dtype(self) -> Any:
-        return jnp.result_type(self._low, self._high)
-
     def _sample_n(self, key: PRNGKey, n: int) -> Any:
         u = jax.random.uniform(key, (n, *self.batch_shape), self.range.dtype)
         return self.low[None] + self.range[None] * u
@@ -134,10 +130,6 @@ class _Pair(Elementwise):
         self._a: jax.Array = float_array(a)
         self._b: jax.Array = float_array(b)
         self._known_numbers = numbers(a, b)
-
-    @property
-    def dtype(self) -> Any:
-        return jnp.result_type(self._a, self._b)
 
 
 class Gamma(_Pair):

@@ -33,10 +33,6 @@ class LocationScale(Elementwise):
         self._loc: jax.Array = float_array(loc)
         self._scale: jax.Array = float_array(scale)
 
-    @property
-    def dtype(self) -> Any:
-        return jnp.result_type(self._loc, self._scale)
-
     def _standardize(self, value):
         return (value - self._loc) / self._scale
 
@@ -46,7 +42,7 @@ class LocationScale(Elementwise):
         return scale * e + loc
 
     def _like_n(self, n):
-        return {"shape": (n, *self.batch_shape), "dtype": self.dtype}
+        return {"shape": (n, *self.batch_shape), "dtype": jnp.result_type(self._loc, self._scale)}
 
 
 class Symmetric(LocationScale):

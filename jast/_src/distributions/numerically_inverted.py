@@ -126,10 +126,6 @@ class StudentT(Symmetric):
         self._df = float_array(df)
         self._known_numbers = numbers(df)
 
-    @property
-    def dtype(self) -> Any:
-        return jnp.result_type(self._df, self._loc, self._scale)
-
     def _sample_n(self, key: PRNGKey, n: int) -> Any:
         shape = (n, *self.batch_shape)
         return self._placed(jax.random.t(key, self.df[None], shape, self.dtype))

@@ -38,9 +38,8 @@ class PointEvaluator:
     def __call__(self, points: np.ndarray) -> transform.Outcomes:
         """`Outcomes` [m] of ``points`` [m, D]."""
         points = np.asarray(points, self.dtype)
-        n, room = len(points), len(points)
-        if self.most is not None:
-            room = max(min(n, self.most - self.spent), 0)
+        n = len(points)
+        room = n if self.most is None else max(min(n, self.most - self.spent), 0)
         self.spent += room
         if room == n:
             return evaluate_points(self.sim, points)

@@ -109,8 +109,7 @@ def parts(formula: Formula, trace: Any, dt: float, *, goes_on: bool = False) -> 
     total, rows = found.own[0], []
 
     def look(f: Formula, v: Values, at: int | None, depth: int) -> None:
-        value = float(v.own[at]) if at is not None else float("nan")
-        time = float("nan") if at is None else at * dt
+        value, time = (np.nan, np.nan) if at is None else (float(v.own[at]), at * dt)
         decides = abs(value) == abs(float(total)) and np.isfinite(value)
         rows.append(
             Part(
