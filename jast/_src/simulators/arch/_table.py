@@ -12,13 +12,12 @@ __all__ = ["along", "read"]
 
 def read(name: str) -> dict[str, Any]:
     """What is in the JSON file ``name`` beside this one; its lists are arrays of float64."""
-    return _arrays(json.loads(Path(__file__).with_name(name).read_text(encoding="utf-8")))
+    text = Path(__file__).with_name(name).read_text(encoding="utf-8")
+    return json.loads(text, object_hook=_arrays)
 
 
-def _arrays(given: Any) -> Any:
-    if isinstance(given, dict):
-        return {name: _arrays(value) for name, value in given.items()}
-    return np.array(given, np.float64)
+def _arrays(given: dict[str, Any]) -> dict[str, Any]:
+    return {k: v if isinstance(v, dict) else np.array(v, np.float64) for k, v in given.items()}
 
 
 def along(table: Any, place: Any) -> Any:

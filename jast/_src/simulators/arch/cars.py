@@ -80,8 +80,7 @@ class _Path(NamedTuple):
 
 def start() -> Cars:
     """The cars at 0 s."""
-    zero = jnp.zeros(())
-    return Cars(jnp.full(4, 10.0), jnp.zeros(5), jnp.zeros(4, jnp.int32), zero)
+    return Cars(jnp.full(4, 10.0), jnp.zeros(5), jnp.zeros(4, jnp.int32), jnp.zeros(()))
 
 
 def drive(cars: Cars, inputs: jax.Array) -> tuple[Cars, Cars]:

@@ -109,16 +109,13 @@ def forces(control, pose, velocity):
 
     (p_u, p_v), (i_u, i_v) = body(error_n, error_e), body(control.sum_n, control.sum_e)
     want_u, want_v = body(control.speed, jnp.zeros_like(control.speed))
-    errors = zip(
-        (p_u, p_v, error_psi),
-        (i_u, i_v, control.sum_psi),
-        (want_u - velocity.u, want_v - velocity.v, -velocity.r),
-        strict=True,
-    )
-    wanted = (
-        kp * p + ki * i + kd * d for kp, ki, kd, (p, i, d) in zip(KP, KI, KD, errors, strict=True)
-    )
-    return Velocity(*(jnp.clip(f, -most, most) for f, most in zip(wanted, THRUST, strict=True)))
+
+    def force(kp, ki, kd, p, i, d, most):
+        return jnp.clip(kp * p + ki * i + kd * d, -most, most)
+
+    errors, integrals = (p_u, p_v, error_psi), (i_u, i_v, control.sum_psi)
+    rates = want_u - velocity.u, want_v - velocity.v, -velocity.r
+    return Velocity(*map(force, KP, KI, KD, errors, integrals, rates, THRUST))
 
 
 def ferry_substep(pose, velocity, control, command, dt):
@@ -131,42 +128,36 @@ def ferry_substep(pose, velocity, control, command, dt):
     u, v, r = velocity
     m_u, m_v, _ = MASS
     turning = (m_v * v * r, -m_u * u * r, (m_u - m_v) * u * v)  # -C(nu) nu: does no work
-    drag = (
-        a + b * jnp.abs(x) + k * x**2
-        for a, b, k, x in zip(LINEAR, QUADRATIC, CUBIC, velocity, strict=True)
-    )
-    velocity = Velocity(
-        *(
-            (m * x + dt * (f + g)) / (m + dt * d)
-            for m, x, f, g, d in zip(MASS, velocity, thrust, turning, drag, strict=True)
-        )
-    )
+
+    def faster(m, x, f, g, a, b, c):
+        drag = a + b * jnp.abs(x) + c * x**2
+        return (m * x + dt * (f + g)) / (m + dt * drag)
+
+    velocity = Velocity(*map(faster, MASS, velocity, thrust, turning, LINEAR, QUADRATIC, CUBIC))
     rate = pose_rate(pose, velocity)
     pose = Pose(*(x + dt * dx for x, dx in zip(pose, rate, strict=True)))
     speed = control.speed + jnp.clip(command - control.speed, -ACCELERATION * dt, ACCELERATION * dt)
     # the reference waits for the ferry
     along = jnp.clip(control.along + dt * speed, pose.n - REACH, pose.n + REACH)
-    sums = zip(
-        (control.sum_n, control.sum_e, control.sum_psi), _errors(control.along, pose), strict=True
-    )
-    return (
-        pose,
-        velocity,
-        Control(along, speed, *(jnp.clip(x + dt * error, -WINDUP, WINDUP) for x, error in sums)),
-    )
+
+    def summed(integral, error):
+        return jnp.clip(integral + dt * error, -WINDUP, WINDUP)
+
+    integrals = control.sum_n, control.sum_e, control.sum_psi
+    sums = map(summed, integrals, _errors(control.along, pose))
+    return pose, velocity, Control(along, speed, *sums)
 
 
 def adversary_substep(adversary, command, dt):
     """The adversary ``dt`` seconds on; its velocities approach ``command`` exponentially (exact),
     the pose follows by the midpoint (second order).
     """
+
+    def nearer(x, to, lag):
+        return to + (x - to) * jnp.exp(-dt / lag)
+
     pose, velocity = adversary
-    after = Velocity(
-        *(
-            to + (x - to) * jnp.exp(-dt / lag)
-            for x, to, lag in zip(velocity, command, LAGS, strict=True)
-        )
-    )
+    after = Velocity(*map(nearer, velocity, command, LAGS))
     mean = Velocity(*((a + b) / 2 for a, b in zip(velocity, after, strict=True)))
     rate = pose_rate(pose._replace(psi=pose.psi + dt / 2 * mean.r), mean)
     return Adversary(Pose(*(x + dt * dx for x, dx in zip(pose, rate, strict=True))), after)
