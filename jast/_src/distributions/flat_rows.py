@@ -1,4 +1,4 @@
-"""A value of any structure as one row of numbers, and back."""
+"""A value of any structure as one row of numbers, and back; or of one number throughout."""
 
 import math
 from typing import Any
@@ -8,7 +8,7 @@ import jax.numpy as jnp
 
 from jast._src.distributions.normal_tails import float_dtype
 
-__all__ = ["flat", "split", "unflat"]
+__all__ = ["filled", "flat", "split", "unflat"]
 
 
 def flat(x: Any) -> jax.Array:
@@ -32,3 +32,8 @@ def unflat(u: jax.Array, event: Any) -> Any:
     floats.
     """
     return jax.tree.map(lambda a, s: a.astype(float_dtype(s.dtype)), split(u, event), event)
+
+
+def filled(event: Any, value: float, *rows: int) -> Any:
+    """Floats [*rows, ...] of one ``value`` in the shapes of ``event``."""
+    return jax.tree.map(lambda s: jnp.full((*rows, *s.shape), value, float_dtype(s.dtype)), event)

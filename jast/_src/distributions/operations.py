@@ -13,7 +13,8 @@ from jax import lax
 
 from jast._src.core.typing import ArrayTree, Density, DistributionLike, PRNGKey
 from jast._src.distributions.family_table import row
-from jast._src.distributions.normal_tails import float_dtype, normal_score, phi
+from jast._src.distributions.flat_rows import filled
+from jast._src.distributions.normal_tails import normal_score, phi
 
 __all__ = [
     "cdf",
@@ -70,7 +71,7 @@ def mode(d: DistributionLike) -> ArrayTree:
             return known(d)
     except NotImplementedError:  # distrax's base class has the method
         pass
-    half = _half(d)
+    half = filled(event_like(d), 0.5)
     try:
         return quantile(d, half)
     except ValueError:
@@ -238,7 +239,7 @@ def has_quantile(d: DistributionLike) -> bool:
         >>> D.has_quantile(D.Poisson(3.0)), D.has_quantile(D.seeds())
         (True, False)
     """
-    return _defined(lambda: quantile(d, _half(d)))
+    return _defined(lambda: quantile(d, filled(event_like(d), 0.5)))
 
 
 def has_cdf(d: DistributionLike) -> bool:
@@ -318,8 +319,3 @@ def _defined(function: Callable[[], Any]) -> bool:
     except ValueError:
         return False
     return True
-
-
-def _half(d: Any) -> Any:
-    """0.5 for each number of a value of ``d``."""
-    return jax.tree.map(lambda s: jnp.full(s.shape, 0.5, float_dtype(s.dtype)), event_like(d))

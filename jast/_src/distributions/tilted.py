@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jast._src.core.typing import Array, ArrayTree, DistributionLike, PRNGKey
 from jast._src.distributions.base import Wrapped
 from jast._src.distributions.family_table import row
-from jast._src.distributions.normal_tails import float_dtype
+from jast._src.distributions.flat_rows import filled
 from jast._src.distributions.operations import event_like, from_normal, has_cdf, to_normal
 
 __all__ = ["Tilted", "tilted", "untiltable"]
@@ -96,10 +96,7 @@ def untiltable(dist: DistributionLike) -> str | None:
         >>> D.untiltable(D.Normal(0.0, 1.0)) is None, D.untiltable(D.seeds()) is None
         (True, False)
     """
-    zeros, ones = (
-        jax.tree.map(lambda s, v=v: jnp.full(s.shape, v, float_dtype(s.dtype)), event_like(dist))
-        for v in (0, 1)
-    )
+    zeros, ones = (filled(event_like(dist), v) for v in (0, 1))
     try:
         tilted(dist, zeros, ones)
     except ValueError as error:

@@ -17,6 +17,7 @@ from jast import distributions as D
 from jast._src.core import actions as choices
 from jast._src.core.policy import Policy
 from jast._src.core.typing import ArrayTree
+from jast._src.distributions.flat_rows import filled
 
 __all__ = [
     "Steps",
@@ -42,13 +43,7 @@ def standard_normal(like, steps, deviation=1):
     """The `Steps` N(0, deviation^2) over ``steps`` disturbances of these shapes and dtypes; by
     default u = Phi(z) is uniform.
     """
-
-    def full(value):
-        return jax.tree.map(
-            lambda s: jnp.full((steps, *s.shape), value, D.float_dtype(s.dtype)), like
-        )
-
-    return Steps(full(0), full(deviation))
+    return Steps(filled(like, 0, steps), filled(like, deviation, steps))
 
 
 def sample(key, steps, offset):
