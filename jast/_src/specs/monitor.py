@@ -114,10 +114,7 @@ def _push_window(
     now = start + known - 1
 
     parts, given = _parts(f), iter(block)
-    of = [
-        values(p, tuple(next(given) for _ in predicates(p)), dt, unknown, sign=sign).own
-        for p in parts
-    ]
+    of = [values(p, given, dt, unknown, sign=sign).own for p in parts]
     turn = -1 if isinstance(f, Temporal) and f.kind == "always" else 1
     inf = jnp.asarray(jnp.inf, of[0].dtype)
     right = turn * of[-1]

@@ -10,6 +10,7 @@ end where it is asked for, or has no sample because it is narrower than dt, is a
 """
 
 import math
+from collections.abc import Iterable
 from functools import partial, reduce
 from typing import Any, NamedTuple
 
@@ -111,7 +112,7 @@ def _robustness(formula: Formula, trace: Any, temperature: Any, dt: float, goes_
 
 def values(
     formula: Formula,
-    given: tuple[jax.Array, ...],
+    given: Iterable[jax.Array],
     dt: float,
     unknown: Any = False,
     pair: sliding_windows.Pair = sliding_windows.exact,
@@ -121,7 +122,7 @@ def values(
 
     Args:
         formula: `Formula`.
-        given: as `margins` returns them.
+        given: as `margins` returns them; of an iterator over more it takes the first.
         dt: seconds between samples.
         unknown: bool scalar: the trace goes on beyond its last sample, where everything may happen
             that makes ``sign`` times the formula great. Else windows are clipped.
