@@ -137,15 +137,14 @@ def _moments(f: Formula, v: Values, at: int | None, dt: float) -> list[int | Non
     if not np.isfinite(v.own[at]):  # open yet
         return [None] * len(v.parts)
     first, last = samples_in("parts", f, dt)
-    end = None if last is None else at + last + 1
-    inside = slice(at + first, end)
+    window = slice(first, None if last is None else last + 1)
+    later = [part.own[at:] for part in v.parts]
     if isinstance(f, Until):
-        left, right = v.parts
-        sofar = np.minimum.accumulate(left.own[at:])[first : None if last is None else last + 1]
-        reached = np.minimum(right.own[inside], sofar)
+        left, right = later
+        reached = np.minimum(right, np.minimum.accumulate(left))[window]
         if not (reached >= v.own[at]).any():  # the right part is open yet: the left one decides
-            return [at + int(np.argmin(left.own[at:])), None]
-        then = at + first + int(np.argmax(reached))
-        return [at + int(np.argmin(left.own[at : then + 1])), then]
+            return [at + int(np.argmin(left)), None]
+        then = first + int(np.argmax(reached))
+        return [at + int(np.argmin(left[: then + 1])), at + then]
     pick = np.argmin if f.kind == "always" else np.argmax
-    return [at + first + int(pick(v.parts[0].own[inside]))]
+    return [at + first + int(pick(later[0][window]))]
