@@ -250,10 +250,8 @@ class Binomial(_Counts):
         below = jnp.log(betainc(n - inner, inner + 1, 1 - p))
         above = jnp.log(betainc(inner + 1, n - inner, p))
         none, all_of = k < 0, k >= n
-        return (
-            jnp.where(none, -jnp.inf, jnp.where(all_of, 0.0, below)),
-            jnp.where(none, 0.0, jnp.where(all_of, -jnp.inf, above)),
-        )
+        below = jnp.where(none, -jnp.inf, jnp.where(all_of, 0.0, below))
+        return below, jnp.where(none, 0.0, jnp.where(all_of, -jnp.inf, above))
 
     def mean(self) -> Any:
         return self.total_count * self.probs

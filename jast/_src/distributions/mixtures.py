@@ -9,6 +9,7 @@ from jast._src.distributions.base import Distribution, Wrapped
 from jast._src.distributions.flat_rows import unflat
 from jast._src.distributions.operations import event_like, from_normal, mode, sample
 from jast._src.distributions.tilted import tilted
+from jast._src.util.pytrees import select
 
 __all__ = ["Blended", "Moved", "blend", "x_of"]
 
@@ -47,11 +48,9 @@ class Blend(_Mixture):
         edges = jnp.cumsum(jnp.exp(self._log_weights))[:-1]
         value = sample(self._parts[0], key)
         for part, edge in zip(self._parts[1:], edges, strict=True):
-            value = jax.tree.map(
-                lambda a, b: jnp.where(u < edge, a, b.astype(a.dtype)),  # noqa: B023
-                value,
-                sample(part, jax.random.clone(key)),
-            )
+            other = sample(part, jax.random.clone(key))
+            other = jax.tree.map(lambda a, b: b.astype(a.dtype), value, other)
+            value = select(u < edge, value, other)
         return value
 
     def log_prob(self, value):

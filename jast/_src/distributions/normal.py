@@ -51,7 +51,8 @@ class Symmetric(LocationScale):
     def mean(self) -> Any:
         return self.loc
 
-    median = mode = mean
+    median = mean
+    mode = mean
 
 
 class Normal(Symmetric):
@@ -112,7 +113,8 @@ class _Vector(Distribution):
     def mean(self) -> Any:
         return self.loc
 
-    median = mode = mean
+    median = mean
+    mode = mean
 
     def stddev(self) -> Any:
         return jnp.sqrt(self.variance())
@@ -216,10 +218,8 @@ class MultivariateNormalTri(_Vector):
             signature="(k),(k,k)->(k)",
         )
         diagonal = jnp.diagonal(self._scale_tri, axis1=-2, axis2=-1)
-        return self._log_prob(
-            solve(value - self._loc, self._scale_tri),
-            0.0 + -jnp.sum(jnp.log(jnp.abs(diagonal)), axis=-1),
-        )
+        e = solve(value - self._loc, self._scale_tri)
+        return self._log_prob(e, 0.0 + -jnp.sum(jnp.log(jnp.abs(diagonal)), axis=-1))
 
     def variance(self) -> Any:
         square = jnp.sum(jnp.square(self._scale_tri), axis=-1)

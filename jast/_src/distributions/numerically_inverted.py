@@ -145,11 +145,8 @@ def _score_t(df, t):
     share = square / df
     near = square < 0.45  # where no more than half lies between, whatever df
     half, rest = jnp.full_like(share, 0.5), df / 2
-    mass = betainc(
-        jnp.where(near, half, rest),
-        jnp.where(near, rest, half),
-        jnp.where(near, share, 1) / (1 + share),
-    )
+    a, b = jnp.where(near, half, rest), jnp.where(near, rest, half)
+    mass = betainc(a, b, jnp.where(near, share, 1) / (1 + share))
     inner = math.sqrt(2) * erfinv(jnp.where(near, mass, 0))
     beyond = jnp.log(jnp.where(near, 1, mass) / 2)
     return jnp.where(near, inner, normal_of_log_tails(jnp.zeros_like(beyond), beyond))

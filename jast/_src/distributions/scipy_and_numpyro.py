@@ -87,12 +87,8 @@ def _of_scipy(d: Any) -> Any:
                 f" {given[parameter]}: move or stretch its value in step"
             )
     # plain numbers stay plain: tables serve them
-    return OF_SCIPY[name](
-        *(
-            v if np.ndim(v) == 0 else jnp.asarray(v)
-            for v in map(given.get, (*shapes, "loc", "scale"))
-        )
-    )
+    values = map(given.get, (*shapes, "loc", "scale"))
+    return OF_SCIPY[name](*(v if np.ndim(v) == 0 else jnp.asarray(v) for v in values))
 
 
 OF_SCIPY: dict[str, Callable[..., Any]] = {

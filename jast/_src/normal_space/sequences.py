@@ -125,10 +125,5 @@ def _start(start, z0):
 
 
 def _disturbance(disturbance, actions, z, state, t):
-    return D.Deterministic(
-        disturbance_at(
-            actions,
-            disturbance(state),
-            jax.tree.map(lambda a: a[jnp.minimum(t, a.shape[0] - 1)], z),
-        )
-    )
+    now = jax.tree.map(lambda a: a[jnp.minimum(t, a.shape[0] - 1)], z)
+    return D.Deterministic(disturbance_at(actions, disturbance(state), now))

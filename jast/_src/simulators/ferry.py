@@ -131,15 +131,8 @@ def _is_terminal(s):
 
 def _observe(s):
     """The five numbers of the published code's networks."""
-    return jnp.stack(
-        [
-            s.ferry_x / 100,
-            s.x / 100,
-            s.y / 100,
-            jnp.sin(s.heading) / 2 + 0.5,
-            jnp.cos(s.heading) / 2 + 0.5,
-        ]
-    )
+    way = jnp.sin(s.heading) / 2 + 0.5, jnp.cos(s.heading) / 2 + 0.5
+    return jnp.stack([s.ferry_x / 100, s.x / 100, s.y / 100, *way])
 
 
 def _observe_text(s):

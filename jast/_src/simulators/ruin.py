@@ -91,10 +91,9 @@ def ruin_probability(
     def step(_, carry):
         mass, won = carry  # mass at the fortunes 1 to goal - 1
         end = jnp.zeros((1,), up.dtype)
-        return (
-            jnp.concatenate([end, up * mass[:-1]]) + jnp.concatenate([(1 - up) * mass[1:], end]),
-            won + up * mass[-1],
-        )
+        gained = jnp.concatenate([end, up * mass[:-1]])
+        lost = jnp.concatenate([(1 - up) * mass[1:], end])
+        return gained + lost, won + up * mass[-1]
 
     mass = jnp.zeros((goal - 1,), up.dtype).at[start - 1].set(1)
     return lax.fori_loop(0, horizon, step, (mass, jnp.zeros((), up.dtype)))[1]

@@ -317,29 +317,16 @@ def _observe(s):
     units of 100 m.
     """
     p, a = s.pose, s.adversary.pose
-    error = ((s.track.n - a.n) / 100, (s.track.e - a.e) / 100)
-    return jnp.stack(
-        [
-            p.n / 100,
-            p.e / 100,
-            p.psi,
-            s.velocity.u,
-            a.n / 100,
-            a.e / 100,
-            jnp.sin(a.psi),
-            jnp.cos(a.psi),
-            *error,
-            s.delay,
-            s.steering,
-        ]
-    )
+    ferry = p.n / 100, p.e / 100, p.psi, s.velocity.u
+    adversary = a.n / 100, a.e / 100, jnp.sin(a.psi), jnp.cos(a.psi)
+    error = (s.track.n - a.n) / 100, (s.track.e - a.e) / 100
+    return jnp.stack([*ferry, *adversary, *error, s.delay, s.steering])
 
 
 def _seen(adversary):
     """The adversary's true `Track`."""
-    return Track(
-        adversary.pose.n, adversary.pose.e, *world_velocity(adversary.pose, adversary.velocity)
-    )
+    pose, velocity = adversary
+    return Track(pose.n, pose.e, *world_velocity(pose, velocity))
 
 
 def _apart(a, b):

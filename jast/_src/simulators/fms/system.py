@@ -283,13 +283,9 @@ def _observe(s):
     ways = jnp.concatenate([goal - here, here - _last(s, 1)]) * 0.6 * jnp.concatenate([east, east])
     wind = s.winds[jnp.maximum(s.t - 1, 0)]
     course = jnp.radians(wind[0])
-    return jnp.concatenate(
-        [
-            jnp.stack([s.t.astype(jnp.float64) / len(s.waypoints)]),
-            ways,
-            jnp.stack([wind[1] / 100, jnp.sin(course), jnp.cos(course)]),
-        ]
-    )
+    placed = s.t.astype(jnp.float64) / len(s.waypoints)
+    last_wind = jnp.stack([wind[1] / 100, jnp.sin(course), jnp.cos(course)])
+    return jnp.concatenate([placed[None], ways, last_wind])
 
 
 def _point(degrees):
