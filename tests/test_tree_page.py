@@ -8,7 +8,7 @@ from systems import TOLD, ring, walk
 
 import jast
 from jast._src.core.signature import signature_of
-from jast._src.page.tree_nodes import nodes_of
+from jast._src.page.tree import nodes_of
 
 CASES = {
     "ring": (ring(), TOLD),

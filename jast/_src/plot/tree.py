@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from jast._src.core.typing import PathLike
-from jast._src.page.tree_nodes import nodes_of
+from jast._src.page.tree import nodes_of, write_tree
 from jast._src.plot import style
 from jast._src.plot.style import Axes
 
@@ -88,6 +88,4 @@ def tree_page(result: Any, path: PathLike, *, tree: int | None = None) -> None:
         ...     os.path.exists(path)
         True
     """
-    from jast._src.page.tree import write_tree
-
     write_tree("plot.tree_page", path, result, tree)
