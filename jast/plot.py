@@ -19,8 +19,8 @@ adversary also `confusion`, `threshold_sweep`, `likely_failures`, `pixel_likelih
 from jast._src.plot.colav import colav, colav_animation, colav_story
 from jast._src.plot.colav_published import colav_published
 from jast._src.plot.cross_entropy import convergence, proposal_contours, surrogate_samples
+from jast._src.plot.curves import exceedance, sweep
 from jast._src.plot.episodes import distances, disturbances, history
-from jast._src.plot.exceedance import exceedance
 from jast._src.plot.failing_inputs import contributions, first_failures
 from jast._src.plot.failure_fan import failure_fan
 from jast._src.plot.ferry import ferry
@@ -29,7 +29,6 @@ from jast._src.plot.probability import probability, weights
 from jast._src.plot.report import report
 from jast._src.plot.sierra import sierra
 from jast._src.plot.style import COLOURS, STYLE
-from jast._src.plot.sweep import sweep
 from jast._src.plot.traces import phase, traces
 from jast._src.plot.training import levels, training
 from jast._src.plot.tree import tree, tree_page

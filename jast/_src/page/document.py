@@ -11,7 +11,7 @@ from typing import Any
 import jax
 import numpy as np
 
-__all__ = ["document", "figure", "plain", "rows", "table", "text", "write"]
+__all__ = ["document", "plain", "rows", "table", "text", "write"]
 
 HERE = Path(__file__).parent
 PAGE = """<!doctype html>
@@ -92,11 +92,6 @@ def text(value: Any) -> str:
     return escape(str(value), quote=True)
 
 
-def figure(value: Any, digits: int = 5) -> str:
-    """A number for a reader."""
-    return f"{float(value):.{digits}g}"
-
-
 def rows(pairs: Iterable[tuple[str, Any]], kind: str = "facts") -> str:
     """A list of names and what is to be said of them."""
     body = "".join(f"<dt>{text(name)}</dt><dd>{text(value)}</dd>" for name, value in pairs)
@@ -108,7 +103,7 @@ def table(head: Iterable[str], body: Iterable[Iterable[Any]]) -> str:
 
     def cell(value: Any) -> str:
         number = isinstance(value, int | float | np.number)
-        words = figure(value) if isinstance(value, float) else text(value)
+        words = f"{value:.5g}" if isinstance(value, float) else text(value)
         return f"<td{' class=number' if number else ''}>{words}</td>"
 
     top = "".join(f"<th>{text(name)}</th>" for name in head)

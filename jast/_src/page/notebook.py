@@ -4,10 +4,19 @@ from base64 import b64encode
 from typing import Any
 
 from jast._src.page.document import text
-from jast._src.stress_testing.report_words import advice, belief, headline, mode_facts, verdict_rows
+from jast._src.stress_testing.report_words import (
+    advice,
+    belief,
+    fact_rows,
+    headline,
+    mode_facts,
+    shown_failures,
+)
 from jast._src.util.display import html_table
 
 __all__ = ["cell"]
+
+MODES = 4  # that are shown
 
 
 def cell(report: Any) -> str:
@@ -16,16 +25,12 @@ def cell(report: Any) -> str:
     """
     told = belief(report.probability)
     reasons = "".join(f"<li>{text(reason)}</li>" for reason in told.reasons)
-    ours = "", "probability", "doubtful"
-    facts = {name: words for name, words in verdict_rows(report) if name not in ours}
-    facts["evaluations"] = f"{report.episodes:,}"
     parts = [
         f"<h3>{text(headline(report)[0])}</h3>",
         f"<p>Probability of failure: <b>{text(told.value)}</b> {text(told.more)}<br>",
-        f"{text(told.badge)}</p><ul>{reasons}</ul>{html_table('', facts)}",
+        f"{text(told.badge)}</p><ul>{reasons}</ul>{html_table('', dict(fact_rows(report)))}",
     ]
-    for i, picture in enumerate(_pictures(report)):
-        failure = report.modes[i].failure if report.modes else report.failures[i]
+    for i, (failure, picture) in enumerate(zip(shown_failures(report, MODES), _pictures(report))):
         words = " &middot; ".join(
             text(f"{name} {value}") for name, value in mode_facts(report, i, failure)
         )
@@ -40,5 +45,5 @@ def _pictures(report: Any) -> list[str]:
 
         files = pictures(report)
     except ImportError:  # matplotlib, which is an extra
-        return [""] * len(report.modes[:4])
+        return [""] * len(report.modes[:MODES])
     return [f'<img src="data:image/png;base64,{b64encode(f).decode()}">' for f in files]

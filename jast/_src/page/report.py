@@ -15,9 +15,10 @@ from jast._src.page.episode_data import exact, groups, pictures, short, states_o
 from jast._src.stress_testing.report_words import (
     advice,
     belief,
+    fact_rows,
     headline,
     mode_facts,
-    verdict_rows,
+    shown_failures,
     work_rows,
 )
 
@@ -70,7 +71,7 @@ def write_report(
             "Report.html: draw needs the simulator, which a report from a file does not hold:"
             " expected html(path, sim, draw=draw)"
         )
-    failures = _shown(report)
+    failures = shown_failures(report, MODES)
     if len(explanations) > len(failures):
         raise ValueError(
             f"Report.html: explanations must be at most {len(failures)}, one for each mode shown,"
@@ -86,11 +87,6 @@ def write_report(
         _settings(report),
     ]
     write(path, document(_title(report), "\n".join(body), data, "report.js"))
-
-
-def _shown(report: Any) -> list[Episode]:
-    """The failure of each card."""
-    return [mode.failure for mode in report.modes[:MODES]] or list(report.failures[:1])
 
 
 def _as_list(explanation: Any) -> list:
@@ -151,13 +147,11 @@ def _title(report: Any) -> str:
 def _head(report: Any, modes: list[dict]) -> str:
     """The verdict on one screen."""
     words, mood = headline(report)
-    ours = "", "probability", "doubtful"
-    known = [(name, value) for name, value in verdict_rows(report) if name not in ours]
     return (
         f'<header><p class="kind">jast: adaptive stress test</p><h1 class="{mood}">{text(words)}'
         f"</h1>{_how(modes[0]) if modes else ''}</header>\n<main>\n<section id=verdict>"
         f"{_probability(report.probability)}"
-        f"{rows([*known, ('evaluations', f'{report.episodes:,}')])}"
+        f"{rows(fact_rows(report))}"
         f"<p class=advice>{text(advice(report))}</p></section>"
     )
 

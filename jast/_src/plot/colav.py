@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from numbers import Real
 from operator import index
 from typing import NamedTuple
 
@@ -24,6 +23,7 @@ from jast._src.plot.style import Axes, FuncAnimation
 from jast._src.simulators.colav.planner import SPEEDS, STILL, ZONES
 from jast._src.simulators.colav.system import COLLISION, ColavState
 from jast._src.simulators.colav.tracker import PERIOD
+from jast._src.util.checks import number, whole_number
 
 __all__ = ["colav", "colav_animation", "colav_story", "draw_moments", "zone_outline"]
 
@@ -167,12 +167,8 @@ def colav_animation(
 
     states = _states("colav_animation", episode, sim)
     path = style.checked_writable("colav_animation", path)
-    if not isinstance(fps, Real) or not 0 < fps < math.inf:
-        raise ValueError(f"plot.colav_animation: fps must be a positive number, received {fps!r}")
-    if isinstance(smooth, bool) or not isinstance(smooth, int) or smooth < 1:
-        raise ValueError(
-            f"plot.colav_animation: smooth must be an int of at least 1, received {smooth!r}"
-        )
+    number("plot.colav_animation", "fps", fps, lambda v: 0 < v < math.inf, "above 0")
+    smooth = whole_number("plot.colav_animation", "smooth", smooth)
     log = _log(states)
     steps = len(states.step) - 1
     low, high = _limits(log, range(steps + 1))

@@ -260,10 +260,7 @@ class _Log:
 
 def _log(caller, result):
     """The `_Log` of one run in the plane, or a ValueError."""
-    if not isinstance(result, CEResult):
-        raise ValueError(
-            f"plot.{caller}: result must be a CEResult, received {type(result).__name__}"
-        )
+    style.checked_kind(caller, "result", result, CEResult, "a CEResult")
     if np.ndim(result.best_value):
         raise ValueError(
             f"plot.{caller}: result must be one run, received one with leading axes"

@@ -17,9 +17,9 @@ from jast._src.normal_space import transform
 from jast._src.plot import style
 from jast._src.plot.style import Axes
 from jast._src.search.result import SearchResult
-from jast._src.util.leaf_names import named_fields
+from jast._src.util.leaf_names import Field, named_fields
 
-__all__ = ["disturbances", "distances", "history", "shade_deviations", "spreads"]
+__all__ = ["disturbances", "distances", "disturbance_fields", "history", "shade_deviations"]
 
 
 def history(
@@ -105,21 +105,14 @@ def disturbances(
     """
     style.one_episode("disturbances", episode)
     n = int(episode.length)
-    if sim is None:
-        first, steps = (), episode.disturbances
-    else:
+    if sim is not None:
         transform.check("plot.disturbances", sim)
-        first, steps = spreads(sim, episode)
-    first = [
-        (f if f.name.startswith("x0") else f._replace(name=f"x0 {f.name}"), 0)
-        for f in named_fields(first, "x0", lead=0)
-    ]
-    arrays = [*first, *((f, 1) for f in named_fields(steps, "x"))]
+    arrays = disturbance_fields(sim, episode)
+    earliest = min((begin for _, begin in arrays), default=1)
     count = max(len(arrays), 1)
     size = (6.8, 1.4 + 2.0 * count)
     with style.panels("disturbances", axes, size, count, "array of x") as axes:
-        for ax, ((name, places, values), begin) in zip(axes, arrays, strict=False):
-            rows = values[:n] if begin else values[None]
+        for ax, ((name, places, rows), begin) in zip(axes, arrays, strict=False):
             few = rows.shape[1] <= len(style.COLOURS)
             if sim is not None:
                 shade_deviations(ax)
@@ -133,7 +126,7 @@ def disturbances(
                 ax.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), title="entry")
             ax.set(
                 ylabel=style.labelled(name, units if sim is None else None),
-                xlim=(-0.5 if first else 0.5, max(n, 1) + 0.5),
+                xlim=(earliest - 0.5, max(n, 1) + 0.5),
             )
             style.whole_steps(ax.xaxis)
         axes[-1].set_xlabel("step")
@@ -148,15 +141,25 @@ def shade_deviations(ax: Axes) -> None:
         ax.axhspan(-reach, reach, color=style.GREY, alpha=alpha, linewidth=0, zorder=0)
 
 
-def spreads(sim: Simulator, episode: Episode) -> tuple[Any, Any]:
-    """How far out x0 (``()`` where the start is fixed) and each disturbance [T, ...] of an episode
-    are, in standard deviations. On the host.
+def disturbance_fields(sim: Simulator | None, episode: Episode) -> list[tuple[Field, int]]:
+    """The disturbances of an episode by step, and the first step of each array. With ``sim`` those
+    of x0, at step 0, come first, and all are in standard deviations.
     """
-    return jax.device_get(_spreads(sim, episode._replace(states=None)))
+    first, steps = (), episode.disturbances
+    if sim is not None:
+        first, steps = jax.device_get(_spreads(sim, episode._replace(states=None)))
+    found = []
+    for field in named_fields(first, "x0", lead=0):
+        name = field.name if field.name.startswith("x0") else f"x0 {field.name}"
+        found.append((field._replace(name=name, values=field.values[None]), 0))
+    for field in named_fields(steps, "x"):
+        found.append((field._replace(values=field.values[: int(episode.length)]), 1))
+    return found
 
 
 @jax.jit
 def _spreads(sim: Simulator, episode: Episode) -> tuple[Any, Any]:
+    """How far out x0 (``()`` where the start is fixed) and each disturbance [T, ...] are."""
     states = jax.tree.map(lambda a: a[:-1], replay(sim, episode).states)
     rows = jax.tree.leaves(episode.disturbances)[0].shape[0]
     states = jax.tree.map(lambda a: a[:rows], states)

@@ -16,7 +16,6 @@ from jast._src.plot.series import (
     Samples,
     by_mode,
     choose_fields,
-    mode_label,
     samples_of,
     series_of,
 )
@@ -93,7 +92,7 @@ def failure_fan(
 def _groups(g: Samples, ends: np.ndarray) -> list[tuple[np.ndarray, str, str, str]]:
     """(which episodes, colour, mark, words) of each kind of failure."""
     if g.mode is not None:
-        return [(own, *style.look(k), mode_label(g, k, len(own))) for k, own in by_mode(g)]
+        return by_mode(g)
     n = len(ends)
     if not ((ends > 0).any() and (ends < 0).any()):
         return [(np.arange(n), style.BLUE, "o", f"{n} failures")]

@@ -42,12 +42,8 @@ def probability(
     rows = estimates if isinstance(estimates, dict) else {None: estimates}
     rows = {name: list(row) if isinstance(row, list) else [row] for name, row in rows.items()}
     found = [e for row in rows.values() for e in row]
-    if not found or not all(isinstance(e, Estimate) for e in found):
-        received = sorted({type(e).__name__ for e in found}) or "none"
-        raise ValueError(
-            f"plot.{caller}: estimates must be an Estimate or a dict of name -> Estimate or list of"
-            f" them, received {received}"
-        )
+    words = "an Estimate or a dict of name -> Estimate or list of them"
+    style.checked_kinds(caller, "estimates", found, Estimate, words)
     if any(e.mean == 0 for e in found):
         raise ValueError(
             f"plot.{caller}: estimates must be above the smallest float64, received log10"

@@ -14,7 +14,7 @@ from jast._src.core.signature import signature_of
 from jast._src.core.simulator import Simulator
 from jast._src.io.codec import name_of
 from jast._src.plot import style
-from jast._src.plot.episodes import shade_deviations, spreads
+from jast._src.plot.episodes import disturbance_fields, shade_deviations
 from jast._src.plot.series import (
     DISTANCE,
     Samples,
@@ -32,12 +32,12 @@ from jast._src.runtime.host_errors import runs_on_host
 from jast._src.stress_testing.report_words import (
     advice,
     belief,
+    fact_rows,
     headline,
     mode_facts,
-    verdict_rows,
+    shown_failures,
     work_rows,
 )
-from jast._src.util.leaf_names import named_fields
 
 if TYPE_CHECKING:
     from jast.stress_testing import Report
@@ -97,12 +97,10 @@ def report(
             f"plot.report: report must be of jast.stress, received a {type(report).__name__}"
         )
     sim = report.sim if sim is None else sim
-    shown = _shown_failures(report)
+    shown = shown_failures(report, MODES)
     told = belief(report.probability)
     left = _probability_rows(told)
-    ours = "", "probability", "doubtful"
-    known = [(name, words) for name, words in verdict_rows(report) if name not in ours]
-    right = _wrapped([*known, ("evaluations", f"{report.episodes:,}")], 43)
+    right = _wrapped(fact_rows(report), 43)
     title = textwrap.wrap(headline(report)[0], 72)
     tried = work_rows(report)
     top = 0.35 + 0.27 * len(title) + 0.15
@@ -133,26 +131,19 @@ def pictures(report: Report) -> list[bytes]:
     """The panels of each of the first modes, as `report` draws them: PNG files. Of a black box,
     which would be called again, they have disturbances alone.
     """
-    from matplotlib.figure import Figure  # one that pyplot does not keep
-    from PIL import Image  # comes with matplotlib
-
     sim = None if report.sim is None or runs_on_host(report.sim) else report.sim
-    shown, files = _shown_failures(report), []
+    shown, files = shown_failures(report, MODES), []
+    frugal = style.frugal_figure(COLOURS)
     with style.styled():
         owned = _series_of_modes(report, sim, shown, None) if shown else None
         for k, failure in enumerate(shown):
-            page = _Page(Figure(figsize=(WIDTH, MODE + 0.35)), MODE + 0.35)
+            # not pyplot's, which would keep it
+            page = _Page(frugal(figsize=(WIDTH, MODE + 0.35)), MODE + 0.35)
             page.y = 0.45
             _draw_mode(page, sim, owned, failure, k, None, legend=True)
-            page.figure.savefig(whole := io.BytesIO(), format="png", dpi=DOTS)
-            few = Image.open(whole).convert("RGB").quantize(COLOURS)
-            few.save(file := io.BytesIO(), format="png", optimize=True)
+            page.figure.savefig(file := io.BytesIO(), format="png", dpi=DOTS)
             files.append(file.getvalue())
     return files
-
-
-def _shown_failures(report: Report) -> list[Episode]:
-    return [mode.failure for mode in report.modes[:MODES]] or list(report.failures[:1])
 
 
 class _Page:
@@ -313,17 +304,12 @@ def _most_unusual(own: Series, behind: Series | None) -> list[str]:
 
 def _draw_disturbances(ax: Any, sim: Any, failure: Any) -> None:
     """The disturbances of a failure over its steps."""
-    n = int(failure.length)
     about = None if sim is None else signature_of(sim)
     normal = about is not None and about.disturbance.quantile and about.start.quantile
-    first, steps = spreads(sim, failure) if normal else ((), failure.disturbances)
-    found = [(f, 0, f.values[None]) for f in named_fields(first, "x0", lead=0)]
-    found += [(f, 1, f.values[:n]) for f in named_fields(steps, "x")]
     named = [
-        (f.name + place, at, v[:, i]) for f, at, v in found for i, place in enumerate(f.entries)
-    ]
-    named = [
-        (f"x0 {name}" if not at and "x0" not in name else name, at, v) for name, at, v in named
+        (field.name + place, at, field.values[:, i])
+        for field, at in disturbance_fields(sim if normal else None, failure)
+        for i, place in enumerate(field.entries)
     ]
     if normal:
         shade_deviations(ax)

@@ -15,6 +15,7 @@ from jast._src.core.signature import signature_of
 from jast._src.core.simulator import Simulator
 from jast._src.io.codec import name_of
 from jast._src.page.episode_data import far
+from jast._src.plot import style
 from jast._src.runtime.host_errors import runs_on_host
 from jast._src.search.refine.modes import Mode, Modes, owners
 from jast._src.search.result import SearchResult
@@ -29,7 +30,6 @@ __all__ = [
     "choose_fields",
     "replays_without_calls",
     "samples_of",
-    "mode_label",
     "by_mode",
     "series_of",
     "nominal_series",
@@ -129,18 +129,18 @@ def _likeliest(modes: Modes) -> Episode:
     return jax.tree.map(lambda *a: np.stack([np.asarray(b) for b in a]), *each)
 
 
-def by_mode(g: Samples) -> list[tuple[int, np.ndarray]]:
-    """(number of the look, which episodes): the modes, or all in one."""
+def by_mode(g: Samples) -> list[tuple[np.ndarray, str, str, str]]:
+    """(which episodes, colour, mark, words of the legend) of each mode, or of all in one."""
+    noun = "failure" if np.asarray(g.episodes.failure).all() else "episode"
     if g.mode is None:
-        return [(1, np.arange(len(g.episodes.length)))]
-    return [(k, np.flatnonzero(g.mode == k)) for k in range(g.modes) if (g.mode == k).any()]
-
-
-def mode_label(g: Samples, kind: int, count: int) -> str:
-    """What a legend calls ``count`` episodes of one kind."""
-    fail = bool(np.asarray(g.episodes.failure).all())
-    what = f"failure{'s' * (count != 1)}" if fail else f"episode{'s' * (count != 1)}"
-    return f"{count} {what}" if g.mode is None else f"mode {kind + 1}: {count} {what}"
+        n = len(g.episodes.length)
+        return [(np.arange(n), *style.look(1), style.count_of(n, noun))]
+    each = [(k, np.flatnonzero(g.mode == k)) for k in range(g.modes)]
+    return [
+        (own, *style.look(k), f"mode {k + 1}: {style.count_of(len(own), noun)}")
+        for k, own in each
+        if len(own)
+    ]
 
 
 def series_of(sim: Simulator, episodes: Episode) -> Series:
@@ -163,9 +163,7 @@ def series_of(sim: Simulator, episodes: Episode) -> Series:
         distance = np.asarray(far(sim, flat), float).reshape(there.shape)
         columns[DISTANCE] = np.where(there, distance, np.nan)
     own = tuple(columns)
-    late = jax.tree.map(
-        lambda a: _from_step_1(np.asarray(a, float), sim.horizon), episodes.disturbances
-    )
+    late = jax.tree.map(lambda a: _from_step_1(a, sim.horizon), episodes.disturbances)
     for name, values in _columns(late, "disturbance", there).items():
         columns[name if name.startswith("disturbance") else f"disturbance {name}"] = values
     return Series(columns, length, own or tuple(columns))

@@ -41,6 +41,8 @@ __all__ = [
     "by_name",
     "checked_iteration",
     "checked_iterations",
+    "checked_kind",
+    "checked_kinds",
     "checked_writable",
     "colour",
     "count_of",
@@ -171,6 +173,23 @@ def one_episode(caller, episode):
     return episode
 
 
+def checked_kind(caller, name, value, kind, words):
+    """``value``, the argument ``name``, or a ValueError where it is no ``kind``; ``words`` say what
+    it must be.
+    """
+    if not isinstance(value, kind):
+        raise ValueError(f"plot.{caller}: {name} must be {words}, received {type(value).__name__}")
+    return value
+
+
+def checked_kinds(caller, name, values, kind, words):
+    """ValueError, as of `checked_kind`, unless there are ``values`` and all are of the ``kind``."""
+    values = list(values)
+    if not values or not all(isinstance(v, kind) for v in values):
+        received = sorted({type(v).__name__ for v in values if not isinstance(v, kind)}) or "none"
+        raise ValueError(f"plot.{caller}: {name} must be {words}, received {received}")
+
+
 def checked_iteration(caller, name, k, run):
     """``k``, the argument ``name``, as an int, or a ValueError where that iteration of ``run`` was
     not run.
@@ -263,9 +282,9 @@ def unframed(ax):
     ax.grid(False)
 
 
-def frugal_figure():
-    """A `Figure` whose PNGs have 256 colours, which are all that one needs: a third of the bytes in
-    an animation's HTML.
+def frugal_figure(colours=256):
+    """A `Figure` whose PNGs have so many colours: 256 are all that one needs, and a third of the
+    bytes in an animation's HTML.
     """
     from matplotlib.figure import Figure
     from PIL import Image
@@ -275,7 +294,7 @@ def frugal_figure():
             if settings.get("format") != "png":
                 return super().savefig(fname, **settings)
             super().savefig(whole := BytesIO(), **settings)
-            Image.open(whole).convert("RGB").quantize(256).save(fname, "png", optimize=True)
+            Image.open(whole).convert("RGB").quantize(colours).save(fname, "png", optimize=True)
 
     return Frugal
 

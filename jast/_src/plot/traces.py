@@ -18,7 +18,6 @@ from jast._src.plot.series import (
     Series,
     by_mode,
     choose_fields,
-    mode_label,
     nominal_series,
     samples_of,
     series_of,
@@ -114,10 +113,8 @@ def draw_traces(
             ax.plot(
                 row, color=style.INK, linewidth=1.3, linestyle=style.DASHED, label="undisturbed"
             )
-        for kind, rows in by_mode(g):
-            colour, marker = style.look(kind)
+        for rows, colour, marker, label in by_mode(g):
             alpha = float(np.clip(14 / len(rows), 0.15, 1.0))
-            label = mode_label(g, kind, len(rows))
             mark = dict(color=colour, marker=marker, markersize=4.5)
             for i in rows:
                 line, n = own.columns[name][i], own.length[i]
@@ -193,8 +190,7 @@ def phase(
             row = [quiet.columns[k][0] for k in names]
             look = dict(color=style.INK, linewidth=1.3, linestyle=style.DASHED)
             ax.plot(*row, **look, label="undisturbed", zorder=3)
-        for kind, rows in by_mode(g):
-            colour, marker = style.look(kind)
+        for rows, colour, marker, label in by_mode(g):
             alpha = float(np.clip(14 / len(rows), 0.15, 1.0))
             mark = dict(color=colour, marker=marker, markersize=6)
             for i in rows:
@@ -205,7 +201,7 @@ def phase(
                 start = dict(color=style.INK, marker="s", markersize=4, zorder=5)
                 ax.plot(across[first], up[first], **start)
                 ax.plot(across[n], up[n], alpha=alpha, zorder=6, **mark)
-            ax.plot([], [], label=mode_label(g, kind, len(rows)), linewidth=1.4, **mark)
+            ax.plot([], [], label=label, linewidth=1.4, **mark)
         ax.set(xlabel=style.labelled(names[0], units), ylabel=style.labelled(names[1], units))
         style.legend_above(ax, fontsize=9)
     return ax

@@ -36,7 +36,8 @@ def training(
         2
     """
     policies = style.by_name(policies)
-    _check("training", "policies", policies, FailurePolicy)
+    words = "a FailurePolicy or a dict of name -> one"
+    style.checked_kinds("training", "policies", policies.values(), FailurePolicy, words)
     with style.panels("training", axes, (6.8, 5.4), 2, "quantity") as axes:
         share, log_p = axes
         for i, (name, policy) in enumerate(policies.items()):
@@ -68,7 +69,8 @@ def levels(proposals: FailureProposal | dict[str, FailureProposal], ax: Axes | N
         >>> ax = jast.plot.levels(found)
     """
     proposals = style.by_name(proposals)
-    _check("levels", "proposals", proposals, FailureProposal)
+    words = "a FailureProposal or a dict of name -> one"
+    style.checked_kinds("levels", "proposals", proposals.values(), FailureProposal, words)
     with style.axes(ax, (6.8, 3.8)) as ax:
         for i, (name, found) in enumerate(proposals.items()):
             reached = np.asarray(found.levels, float)
@@ -83,15 +85,6 @@ def levels(proposals: FailureProposal | dict[str, FailureProposal], ax: Axes | N
         style.whole_steps(ax.xaxis)
         _legend(ax, proposals)
     return ax
-
-
-def _check(caller: str, name: str, given: dict, kind: type) -> None:
-    received = sorted({type(v).__name__ for v in given.values()}) or "none"
-    if not given or not all(isinstance(v, kind) for v in given.values()):
-        raise ValueError(
-            f"plot.{caller}: {name} must be a {kind.__name__} or a dict of name -> one, received"
-            f" {received}"
-        )
 
 
 def _legend(ax: Any, named: dict) -> None:

@@ -13,7 +13,7 @@ from jast._src.plot.style import Axes
 from jast._src.weakness import measures
 from jast._src.weakness.result import Result
 
-__all__ = ["checked_result", "checked_truth", "failures_found", "roc"]
+__all__ = ["checked_result", "failures_found", "roc"]
 
 LIGHT, DARK = "#A9CCE6", "#06263D"  # of the first and the last iteration
 
@@ -50,7 +50,7 @@ def failures_found(
     caller = "failures_found"
     rows = _rows(caller, results)
     n = _same_n(caller, rows)
-    truth = None if failed is None else checked_truth(caller, failed, n)
+    truth = None if failed is None else measures.checked_truth(f"plot.{caller}", failed, n)
     for result in [] if truth is None else [result for row in rows.values() for result in row]:
         wrong = int(np.sum(truth[result.order] != _hits(result)))
         if wrong:
@@ -122,7 +122,7 @@ def roc(
     """
     caller = "roc"
     made = len(checked_result(caller, result).history.scores)
-    truth = checked_truth(caller, failed, len(result.scores))
+    truth = measures.checked_truth(f"plot.{caller}", failed, len(result.scores))
     if not made:
         raise ValueError(f"plot.{caller}: result must have iterations, received none")
     evenly = np.linspace(1, made, min(4, made))
@@ -157,12 +157,7 @@ def roc(
 
 def checked_result(caller, result):
     """``result``, or a ValueError where it is none."""
-    if not isinstance(result, Result):
-        raise ValueError(
-            f"plot.{caller}: result must be a jast.weakness.Result, received"
-            f" {type(result).__name__}"
-        )
-    return result
+    return style.checked_kind(caller, "result", result, Result, "a jast.weakness.Result")
 
 
 def _rows(caller, results):
@@ -172,12 +167,8 @@ def _rows(caller, results):
     rows = style.by_name(results)
     rows = {name: row if isinstance(row, list) else [row] for name, row in rows.items()}
     every = [result for row in rows.values() for result in row]
-    if not rows or not all(rows.values()) or not all(isinstance(r, Result) for r in every):
-        received = sorted({type(r).__name__ for r in every} - {"Result"}) or "none"
-        raise ValueError(
-            f"plot.{caller}: results must be a jast.weakness.Result, a list of them or a dict of"
-            f" name -> either, received {received}"
-        )
+    words = "a jast.weakness.Result, a list of them or a dict of name -> either"
+    style.checked_kinds(caller, "results", every if all(rows.values()) else (), Result, words)
     return rows
 
 
@@ -190,17 +181,6 @@ def _same_n(caller, rows):
             f" {', '.join(map(str, sizes))} inputs"
         )
     return sizes[0]
-
-
-def checked_truth(caller, failed, n):
-    """``failed`` as an array, or a ValueError."""
-    truth = np.asarray(failed)
-    if truth.shape != (n,) or truth.dtype != bool:
-        raise ValueError(
-            f"plot.{caller}: failed must be bool [{n}], received {truth.dtype} of shape"
-            f" {truth.shape}"
-        )
-    return truth
 
 
 def _hits(result):

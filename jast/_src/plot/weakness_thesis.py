@@ -14,10 +14,10 @@ import numpy as np
 from jast._src.core.typing import Array
 from jast._src.plot import style
 from jast._src.plot.style import Axes
-from jast._src.plot.weakness import checked_result, checked_truth
+from jast._src.plot.weakness import checked_result
 from jast._src.util.checks import number, whole_number
 from jast._src.weakness.encoded import Encoded
-from jast._src.weakness.measures import precision_recall
+from jast._src.weakness.measures import checked_truth, precision_recall
 from jast._src.weakness.result import Result
 
 __all__ = ["confusion", "likely_failures", "pixel_likelihood", "threshold_sweep"]
@@ -53,7 +53,7 @@ def confusion(
     """
     caller = "confusion"
     scores = np.asarray(checked_result(caller, result).scores)
-    failed = checked_truth(caller, failed, len(scores))
+    failed = checked_truth(f"plot.{caller}", failed, len(scores))
     threshold = number(f"plot.{caller}", "threshold", threshold, lambda v: 0 <= v <= 1, "in 0 .. 1")
     chosen = scores >= threshold
     counts = np.array([[np.sum((failed == t) & (chosen == c)) for c in (0, 1)] for t in (0, 1)])
@@ -99,7 +99,7 @@ def threshold_sweep(
     """
     caller = "threshold_sweep"
     scores = np.asarray(checked_result(caller, result).scores)
-    failed = checked_truth(caller, failed, len(scores))
+    failed = checked_truth(f"plot.{caller}", failed, len(scores))
     at = np.linspace(0, 1, whole_number(f"plot.{caller}", "thresholds", thresholds, 2))
     precision, recall = np.array([precision_recall(scores >= t, failed) for t in at]).T
     with style.axes(ax, (5.4, 3.6)) as ax:
@@ -156,7 +156,7 @@ def likely_failures(
             f"plot.{caller}: inputs must be the images of the validation, {[n, *networks.shape]},"
             f" received shape {inputs.shape}"
         )
-    failed = checked_truth(caller, failed, n)
+    failed = checked_truth(f"plot.{caller}", failed, n)
     if kind not in KINDS:
         raise ValueError(f"plot.{caller}: kind must be one of {list(KINDS)}, received {kind!r}")
     suspect = networks.scores >= 0.5
@@ -226,9 +226,5 @@ def pixel_likelihood(networks: Encoded, ax: Axes | None = None) -> Axes:
 
 
 def _networks(caller, networks):
-    if not isinstance(networks, Encoded):
-        raise ValueError(
-            f"plot.{caller}: networks must be jast.weakness.encoded of a result, received"
-            f" {type(networks).__name__}"
-        )
-    return networks
+    words = "jast.weakness.encoded of a result"
+    return style.checked_kind(caller, "networks", networks, Encoded, words)

@@ -12,9 +12,11 @@ from jast._src.runtime.host_errors import incidents
 __all__ = [
     "advice",
     "belief",
+    "fact_rows",
     "headline",
     "mode_facts",
     "share_of_runs",
+    "shown_failures",
     "two_digits",
     "verdict_rows",
     "work_rows",
@@ -186,6 +188,22 @@ def verdict_rows(r: Any) -> list[tuple[str, str]]:
     if "interrupted" in r.settings:
         rows.append(("interrupted", r.settings["interrupted"]))
     return rows
+
+
+def fact_rows(r: Any) -> list[tuple[str, str]]:
+    """The rows of `verdict_rows` without those of the probability, which pages and pictures show by
+    itself, and the number of evaluations.
+    """
+    of_probability = "", "probability", "doubtful"
+    rows = [(name, words) for name, words in verdict_rows(r) if name not in of_probability]
+    return [*rows, ("evaluations", f"{r.episodes:,}")]
+
+
+def shown_failures(r: Any, most: int) -> list[Any]:
+    """The likeliest failure of each of the first ``most`` modes; where there are no modes, the best
+    failure, if there is one.
+    """
+    return [mode.failure for mode in r.modes[:most]] or list(r.failures[:1])
 
 
 def _probability_rows(p):

@@ -13,7 +13,7 @@ from jast._src.util import display
 from jast._src.util.checks import number, whole_number
 from jast._src.weakness.result import Result
 
-__all__ = ["Judgement", "Roc", "auc", "judge", "precision_recall", "roc"]
+__all__ = ["Judgement", "Roc", "auc", "checked_truth", "judge", "precision_recall", "roc"]
 
 
 @display.printable()
@@ -161,13 +161,8 @@ def judge(
         "judge", "threshold", threshold, lambda v: not np.isnan(v), "to compare scores with"
     )
     every = np.asarray(result.history.scores)
-    failed = np.asarray(failed)
-    if failed.shape != every.shape[1:] or failed.dtype != bool:
-        raise ValueError(
-            f"judge: failed must be bool [{every.shape[1]}], received {failed.dtype} of shape"
-            f" {failed.shape}"
-        )
-    n = len(failed)
+    n = every.shape[1]
+    failed = checked_truth("judge", failed, n)
     if not failed[result.failures].all():
         raise ValueError(
             "judge: failed must agree with the result, whose failures are not all among them"
@@ -183,6 +178,16 @@ def judge(
         rows.append((auc(scores, failed), *precision_recall(chosen, failed), int(np.sum(chosen))))
     columns = zip(*rows, strict=True) if rows else np.zeros((4, 0))
     return Judgement(*map(np.asarray, columns))
+
+
+def checked_truth(function, failed, n):
+    """``failed`` as an array, or a ValueError unless it is bool [n]."""
+    truth = np.asarray(failed)
+    if truth.shape != (n,) or truth.dtype != bool:
+        raise ValueError(
+            f"{function}: failed must be bool [{n}], received {truth.dtype} of shape {truth.shape}"
+        )
+    return truth
 
 
 def precision_recall(chosen, failed):
