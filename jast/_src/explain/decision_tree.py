@@ -6,9 +6,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jast._src.explain.held_out import hold_out
+from jast._src.explain.held_out import hold_out, share_of
 from jast._src.util import display
-from jast._src.util.intervals import clopper_pearson
 
 __all__ = ["Rule", "grow_tree", "read_rules"]
 
@@ -79,8 +78,8 @@ def read_rules(tree, features, names, leaf, truth, level) -> tuple:
             if k:
                 here, own = leaf == node, truth == k
                 hits = int(np.sum(here & own))
-                precision, precise = _share(hits, int(here.sum()), level)
-                recall, recalled = _share(hits, int(own.sum()), level)
+                precision, precise = share_of(hits, int(here.sum()), level)
+                recall, recalled = share_of(hits, int(own.sum()), level)
                 conditions = tuple(
                     (features[i].name, features[i].kind, low, high)
                     for i, (low, high) in bounds.items()
@@ -102,12 +101,6 @@ def read_rules(tree, features, names, leaf, truth, level) -> tuple:
 
     walk(0, {})
     return tuple(sorted(found, key=lambda r: (names.index(r.label), -r.recall)))
-
-
-def _share(part: int, all_: int, level: float) -> tuple:
-    if not all_:
-        return float("nan"), (0.0, 1.0)
-    return part / all_, clopper_pearson(part, all_, level)
 
 
 def _condition(condition: tuple) -> str:

@@ -10,7 +10,7 @@ from jast._src.core.signature import signature_of
 from jast._src.core.simulator import Simulator
 from jast._src.explain.episodes import FullEpisodes
 from jast._src.normal_space.episode_point import names_of_leaves
-from jast._src.util.leaf_names import named_fields
+from jast._src.util.leaf_names import named_numbers
 
 __all__ = ["Describer", "Feature", "feature_table", "make_describer"]
 
@@ -62,7 +62,7 @@ def feature_table(
     """
     found: list[tuple[Feature, np.ndarray]] = []
     if d.of != "states":
-        for name, v in _columns(episodes.x0, "x0", 1):
+        for name, v in named_numbers(episodes.x0, "x0"):
             found.append((Feature(f"{name} at the start", "number"), v))
         parts = _components(sim, episodes)
         for name, v in parts:
@@ -85,13 +85,6 @@ def _components(sim: Simulator, episodes: FullEpisodes) -> list[tuple[str, np.nd
     leaves = map(np.asarray, jax.tree.leaves(episodes.disturbances))
     rows = [a.reshape(*a.shape[:2], -1) for a in leaves]
     return [(next(named), a[..., i]) for a in rows for i in range(a.shape[-1])]
-
-
-def _columns(tree: Any, root: str, lead: int) -> Iterator[tuple[str, np.ndarray]]:
-    """(name, values) of each number of ``tree``, whose first ``lead`` axes stay."""
-    for part in named_fields(tree, root, lead):
-        for i, entry in enumerate(part.entries):
-            yield part.name + entry, part.values[..., i]
 
 
 def _windows(v: np.ndarray, finest: int) -> Iterator[tuple[str, int, np.ndarray]]:
@@ -179,14 +172,13 @@ def _of_states(
     """Of the states that are seen until step ``at`` [n]."""
     rows, when = np.arange(len(at)), f"{lead} step{'s' * (lead != 1)} before the end"
     seen = np.arange(sim.horizon + 1) <= at[:, None]
-    for name, v in _columns(states, "state", 2):
-        yield Feature(f"{name} {when}", "number"), v[rows, at]
-        yield (
-            Feature(f"greatest {name} until {when}", "number"),
-            np.where(seen, v, -np.inf).max(axis=1),
-        )
-        yield Feature(f"least {name} until {when}", "number"), np.where(seen, v, np.inf).min(axis=1)
-        mean = np.where(seen, v, 0.0).sum(axis=1) / (at + 1)
-        yield Feature(f"mean {name} until {when}", "number"), mean
-        rise = v[rows, at] - v[rows, np.maximum(at - 4, 0)]
-        yield Feature(f"rise of {name} in the 4 steps until {when}", "number"), rise
+    for name, v in named_numbers(states, "state", lead=2):
+        now, before = v[rows, at], v[rows, np.maximum(at - 4, 0)]
+        for words, values in (
+            (f"{name} {when}", now),
+            (f"greatest {name} until {when}", np.where(seen, v, -np.inf).max(axis=1)),
+            (f"least {name} until {when}", np.where(seen, v, np.inf).min(axis=1)),
+            (f"mean {name} until {when}", np.where(seen, v, 0.0).sum(axis=1) / (at + 1)),
+            (f"rise of {name} in the 4 steps until {when}", now - before),
+        ):
+            yield Feature(words, "number"), values

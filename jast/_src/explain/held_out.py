@@ -5,8 +5,9 @@ from typing import Any
 import numpy as np
 
 from jast._src.util.checks import import_library
+from jast._src.util.intervals import clopper_pearson
 
-__all__ = ["DISTINCT", "hold_out", "sklearn_module"]
+__all__ = ["DISTINCT", "hold_out", "share_of", "sklearn_module"]
 
 DISTINCT = 4  # episodes of a class, the least
 
@@ -33,3 +34,10 @@ def hold_out(
         if not taken:
             side[groups[np.argmin(sizes)]] = True
     return np.array([side[g] for g in group])
+
+
+def share_of(part: int, whole: int, level: float) -> tuple[float, tuple[float, float]]:
+    """The share ``part`` of ``whole``, with its interval; NaN of nothing."""
+    if not whole:
+        return float("nan"), (0.0, 1.0)
+    return part / whole, clopper_pearson(part, whole, level)

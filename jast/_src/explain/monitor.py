@@ -12,10 +12,9 @@ from jast._src.core.counter_prng import numpy_generator
 from jast._src.core.simulator import Simulator
 from jast._src.core.typing import PRNGKey
 from jast._src.explain.episodes import draw_ordinary, observations
-from jast._src.explain.held_out import hold_out, sklearn_module
+from jast._src.explain.held_out import hold_out, share_of, sklearn_module
 from jast._src.explain.training_cases import given_cases, simulate_cases
 from jast._src.util import checks, display
-from jast._src.util.intervals import clopper_pearson
 from jast._src.weakness.measures import Roc, roc
 
 __all__ = ["Monitor", "monitor"]
@@ -223,8 +222,8 @@ def monitor(
         model=fitted,
         within=within,
         threshold=threshold,
-        false_alarms=_share(wrong, level),
-        warned=_share(hit, level),
+        false_alarms=share_of(int(wrong.sum()), len(wrong), level),
+        warned=share_of(int(hit.sum()), len(hit), level),
         ahead=tuple(map(float, ahead)),
         auc=curve.area,
         auc_interval=_area_interval(rng, score, soon, rows, group, level),
@@ -277,11 +276,6 @@ def _threshold(maxima: np.ndarray, rate: float) -> float:
     """The least above which a share of at most ``rate`` of ``maxima`` is."""
     n = len(maxima)
     return float(maxima[n - 1 - min(int(rate * n), n - 1)])
-
-
-def _share(which: np.ndarray, level: float) -> tuple[float, tuple[float, float]]:
-    """Of ``which`` [n] bool those that are True, with the interval."""
-    return float(which.mean()), clopper_pearson(int(which.sum()), len(which), level)
 
 
 def _area_interval(rng, score, soon, rows, group, level) -> tuple[float, float]:

@@ -170,10 +170,8 @@ def rules(
     key = jax.random.key(0) if key is None else key
     checks.check_random_key(name, key)
     episodes = checks.whole_number(name, "episodes", episodes, 20)
-    most, lead = (
-        checks.whole_number(name, "most", most, 2),
-        checks.whole_number(name, "lead", lead, 0),
-    )
+    most = checks.whole_number(name, "most", most, 2)
+    lead = checks.whole_number(name, "lead", lead, 0)
     if budget is not None:
         budget = checks.whole_number(name, "budget", budget, 1)
     level = checks.number(name, "level", level, lambda v: 0 < v < 1, "between 0 and 1")

@@ -107,10 +107,8 @@ def sensitivity(
     name = "sensitivity"
     key = jax.random.key(0) if key is None else key
     checks.check_random_key(name, key)
-    samples, level = (
-        checks.whole_number(name, "samples", samples, LANES),
-        checked_level(name, level),
-    )
+    samples = checks.whole_number(name, "samples", samples, LANES)
+    level = checked_level(name, level)
     transform.check(name, sim)
     q = getattr(estimate, "proposal", None)
     if not is_proposal_of(sim, q):

@@ -5,7 +5,7 @@ import numpy as np
 
 from jast._src.core.episode import Episode
 from jast._src.page.episode_data import short
-from jast._src.util.leaf_names import named_fields
+from jast._src.util.leaf_names import named_numbers
 from jast.explain import Eigenfailures
 
 __all__ = ["directions"]
@@ -40,7 +40,6 @@ def directions(found: Eigenfailures) -> list[dict]:
 def _columns(e: Episode, steps: np.ndarray) -> dict[str, list[float]]:
     """Name of a number -> its values at ``steps``, NaN behind the end."""
     return {
-        f.name + entry: short(np.where(steps <= e.length, f.values[steps - 1, i], np.nan))
-        for f in named_fields(e.disturbances, "x")
-        for i, entry in enumerate(f.entries)
+        name: short(np.where(steps <= e.length, values[steps - 1], np.nan))
+        for name, values in named_numbers(e.disturbances, "x")
     }

@@ -20,7 +20,7 @@ from jast._src.runtime.host_errors import runs_on_host
 from jast._src.search.refine.modes import Mode, Modes, owners
 from jast._src.search.result import SearchResult
 from jast._src.util.checks import whole_number
-from jast._src.util.leaf_names import named_fields
+from jast._src.util.leaf_names import named_numbers
 from jast.estimate import FailureSamples
 
 __all__ = [
@@ -186,11 +186,8 @@ _compiled_states, _compiled_draws = jax.jit(_states), jax.jit(_drawn)
 
 
 def _columns(tree: Any, root: str, there: np.ndarray) -> dict[str, np.ndarray]:
-    return {
-        name + place: np.where(there, values[..., j], np.nan)
-        for name, places, values in named_fields(tree, root, lead=2)
-        for j, place in enumerate(places)
-    }
+    found = named_numbers(tree, root, lead=2)
+    return {name: np.where(there, values, np.nan) for name, values in found}
 
 
 def _from_step_1(a: np.ndarray, horizon: int) -> np.ndarray:

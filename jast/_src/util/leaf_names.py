@@ -1,12 +1,13 @@
 """What the numbers of a user's pytrees are called: one naming for tables, pages and pictures."""
 
+from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 from jax.tree_util import SequenceKey
 
-__all__ = ["Field", "leaf_name", "entry_places", "named_fields", "path_name"]
+__all__ = ["Field", "leaf_name", "entry_places", "named_fields", "named_numbers", "path_name"]
 
 
 class Field(NamedTuple):
@@ -54,3 +55,10 @@ def named_fields(tree: Any, root: str, lead: int = 1) -> list[Field]:
         flat = a.reshape(*a.shape[:lead], -1).astype(float)
         found.append(Field(leaf_name(path, root), entry_places(a.shape[lead:]), flat))
     return found
+
+
+def named_numbers(tree: Any, root: str, lead: int = 1) -> Iterator[tuple[str, np.ndarray]]:
+    """(name, values) of each number of the arrays of `named_fields`: "speed", "position[0]"."""
+    for name, entries, values in named_fields(tree, root, lead):
+        for i, entry in enumerate(entries):
+            yield name + entry, values[..., i]
