@@ -352,13 +352,13 @@ def _refit_mixture(plan, settings, proposal, elites, sub, spread, everything):
     k = plan.components
     there = elites.weights[:k]
     weights = there / jnp.maximum(jnp.sum(there), 1)
-    means, covariances = (
-        (sub.fitted.mean[:k], sub.fitted.covariance[:k])
-        if plan.start == "searches"
-        else (elites.x[:k], jnp.broadcast_to(spread[None], (k, *spread.shape)))
-    )
+    if plan.start == "searches":
+        first = Mixture(weights, sub.fitted.mean[:k], sub.fitted.covariance[:k])
+    else:
+        covariances = jnp.broadcast_to(spread[None], (k, *spread.shape))
+        first = Mixture(weights, elites.x[:k], covariances)
     new = mixture.em(
-        Mixture(weights, means, covariances),
+        first,
         *everything,
         iterations=plan.em_iterations,
         regularisation=settings.regularisation,

@@ -82,10 +82,8 @@ def sierra(
     if not isinstance(log, bool):
         raise ValueError(f"sierra: log must be True or False, received {log!r}")
     try:
-        if is_traced(mean):
-            good = jnp.asarray(mean).shape == (2,)
-        else:
-            good = np.shape(mean) == (2,) and np.isfinite(np.float64(mean)).all()
+        given = jnp.asarray(mean) if is_traced(mean) else np.asarray(mean, float)
+        good = given.shape == (2,) and (is_traced(mean) or np.isfinite(given).all())
     except (TypeError, ValueError):  # no numbers, or rows of different lengths
         good = False
     if not good:

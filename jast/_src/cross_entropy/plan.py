@@ -98,10 +98,8 @@ def make_plan(
         if not isinstance(value, bool):
             raise ValueError(f"{method}: {name} must be True or False, received {value!r}")
     given_optimism = chosen.get("optimism", 0.0)
-    positive, other = (
-        (lambda v: 0 < v < math.inf, "above 0"),
-        (lambda v: 0 <= v < math.inf, "of at least 0"),
-    )
+    positive = (lambda v: 0 < v < math.inf), "above 0"
+    other = (lambda v: 0 <= v < math.inf), "of at least 0"
     numbers = [
         real_number(method, name, chosen.pop(name, default), *check)
         for name, default, check in (
@@ -123,16 +121,8 @@ def make_plan(
             method, chosen, given_optimism, max(sizes), mean_size, kept, mean.shape[-1]
         )
     settings = Settings(*(value.astype(mean.dtype) for value in numbers))
-    return (
-        Plan(
-            method,
-            sizes,
-            tuple(kept),
-            **{name: value for name, value in chosen.items() if name in Plan._fields},
-        ),
-        settings,
-        proposal,
-    )
+    static = {name: value for name, value in chosen.items() if name in Plan._fields}
+    return Plan(method, sizes, tuple(kept), **static), settings, proposal
 
 
 def _surrogate_plan(method, chosen, optimism, most, each, kept, d):
@@ -218,11 +208,9 @@ def _first_mixture(method, proposal, elites, components, asked):
             )
     else:
         g = as_gaussian(proposal)
-        k = (
-            whole_number(method, "components", asked, 1)
-            if asked is not None
-            else min(components or elites, elites)
-        )
+        k = min(components or elites, elites)
+        if asked is not None:
+            k = whole_number(method, "components", asked, 1)
         d = g.mean.size
         proposal = Mixture(
             jnp.full((k,), 1 / k, g.mean.dtype),

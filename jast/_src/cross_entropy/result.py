@@ -158,10 +158,8 @@ def scores(result: CEResult, optimum: Array | None) -> Scores:
         >>> len(ce.scores(runs, jnp.zeros(2)).best_value)
         10
     """
-    x, value = (
-        np.asarray(result.history.best_x, float),
-        np.asarray(result.history.best_value, float),
-    )
+    x = np.asarray(result.history.best_x, float)
+    value = np.asarray(result.history.best_value, float)
     if x.ndim != 3:
         raise ValueError(
             "scores: result must be a batch of runs, its history.best_x [runs, iterations, d],"

@@ -89,15 +89,7 @@ def manual(counts: Sequence[int]) -> Schedule:
     """
     sizes = _whole(counts)
 
-    def schedule(budget, iterations):
-        if (len(sizes), sum(sizes)) != (iterations, budget):
-            raise ValueError(
-                f"schedule: expected {iterations} counts that sum to {budget}, received"
-                f" {len(sizes)} that sum to {sum(sizes)}: {sizes}"
-            )
-        return sizes
-
-    return schedule
+    return lambda budget, iterations: _summing_to(budget, iterations, sizes)
 
 
 def counts(schedule: Schedule, samples: int, iterations: int) -> tuple[int, ...]:
@@ -124,11 +116,9 @@ def counts(schedule: Schedule, samples: int, iterations: int) -> tuple[int, ...]
     """
     if not callable(schedule) and not isinstance(schedule, str) and schedule is not None:
         return _whole(schedule)
-    samples, iterations = (
-        whole_number("schedule", "samples", samples),
-        whole_number("schedule", "iterations", iterations),
-    )
-    if schedule is None or (isinstance(schedule, str) and schedule == "uniform"):
+    samples = whole_number("schedule", "samples", samples)
+    iterations = whole_number("schedule", "iterations", iterations)
+    if schedule is None or schedule == "uniform":
         return (samples,) * iterations
     if isinstance(schedule, str):
         raise ValueError(
@@ -143,7 +133,11 @@ def counts(schedule: Schedule, samples: int, iterations: int) -> tuple[int, ...]
             f"schedule: expected a function (budget, iterations) -> counts, received {schedule!r},"
             f" which raised: {error}"
         ) from error
-    sizes = _whole(sizes)
+    return _summing_to(budget, iterations, _whole(sizes))
+
+
+def _summing_to(budget, iterations, sizes):
+    """``sizes``, or a ValueError unless they are one for each iteration and sum to the budget."""
     if (len(sizes), sum(sizes)) != (iterations, budget):
         raise ValueError(
             f"schedule: expected {iterations} counts that sum to the budget {budget}, received"
