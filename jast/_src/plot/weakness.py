@@ -247,13 +247,8 @@ def _apart(heights, gap, low, high):
     """Rising heights moved as little as it takes to be at least ``gap`` apart, in low ... high
     where they fit.
     """
-    blocks = []
-    for i, y in enumerate(heights):
-        blocks.append((y - i * gap, 1))
-        while len(blocks) > 1 and blocks[-2][0] > blocks[-1][0]:
-            (a, m), (b, k) = blocks[-2:]
-            blocks[-2:] = [((a * m + b * k) / (m + k), m + k)]
-    level = np.repeat([y for y, _ in blocks], [k for _, k in blocks])
-    return np.clip(level, low, max(high - (len(heights) - 1) * gap, low)) + gap * np.arange(
-        len(heights)
-    )
+    from scipy.optimize import isotonic_regression  # here: slow to import
+
+    apart = gap * np.arange(len(heights))
+    level = isotonic_regression(np.asarray(heights, float) - apart).x
+    return np.clip(level, low, max(high - apart.max(initial=0), low)) + apart

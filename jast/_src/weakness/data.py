@@ -90,20 +90,15 @@ def check_data(function, inputs, labels, classes=None):
             f" {inputs.max()}"
         )
     if labels.shape != (len(inputs),) or labels.dtype.kind not in "iub":
-        hint = (
-            ""
-            if labels.dtype.kind in "iub"
-            else "; np.unique(labels, return_inverse=True)[1] makes such numbers"
-        )
+        hint = ""
+        if labels.dtype.kind not in "iub":
+            hint = "; np.unique(labels, return_inverse=True)[1] makes such numbers"
         raise ValueError(
             f"{function}: labels must be whole numbers [{len(inputs)}], one for each input,"
             f" received {labels.dtype} of shape {labels.shape}{hint}"
         )
-    classes = (
-        max(int(labels.max()) + 1, 2)
-        if classes is None
-        else whole_number(function, "classes", classes, 2)
-    )
+    classes = max(int(labels.max()) + 1, 2) if classes is None else classes
+    classes = whole_number(function, "classes", classes, 2)
     if classes > MOST_CLASSES:
         raise ValueError(
             f"{function}: there may be {MOST_CLASSES} classes, received {classes};"

@@ -81,11 +81,9 @@ def default(
         rng = numpy_generator(key)
         reduced = reduce_inputs(rng, data)
         seen_as = make_views(data, reduced)
-        close = (
-            reduced[:, :CLOSE]
-            if reduced.shape[1]
-            else principal_components(rng, seen_as.centred, CLOSE)
-        )
+        close = reduced[:, :CLOSE]
+        if not reduced.shape[1]:
+            close = principal_components(rng, seen_as.centred, CLOSE)
         learn = committee.folds(rng, data.size, min(5, data.size), repeats)
         difficulty = sum(
             _odds(rng, view, data.labels, learn, learn, data) for view in seen_as

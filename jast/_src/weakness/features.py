@@ -69,10 +69,8 @@ def scale_inputs(data):
     """
     # small differences may lie on a large mean
     wide = data.inputs.dtype.itemsize > 4 or not data.image
-    x, over = (
-        data.inputs.reshape(data.size, -1).astype(np.float64 if wide else np.float32),
-        None if data.image else 0,
-    )
+    x = data.inputs.reshape(data.size, -1).astype(np.float64 if wide else np.float32)
+    over = None if data.image else 0
     if not data.image:  # a few values far out must not press the others together
         low, high = np.quantile(x, (0.01, 0.99), axis=0)
         x = np.where(high > low, np.clip(x, low - (high - low), high + (high - low)), x)

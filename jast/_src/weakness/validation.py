@@ -291,13 +291,9 @@ def _answers(predict, data, batch):
             f" {where}"
         ) from error
     if said.shape != batch.shape or said.dtype.kind not in "iub":
-        hint = (
-            "; give the argmax of scores"
-            if said.dtype.kind == "f" and said.ndim > 1
-            else "; give them as integers"
-            if said.dtype.kind == "f"
-            else ""
-        )
+        hint = ""
+        if said.dtype.kind == "f":
+            hint = "; give the argmax of scores" if said.ndim > 1 else "; give them as integers"
         raise _NoAnswer(
             f"predict must return whole numbers [{len(batch)}], received {said.dtype} of shape"
             f" {said.shape}{hint}, on {where}"
@@ -321,12 +317,9 @@ def _row(history, step, seen):
     """``history`` and one more iteration."""
     failed, tried = seen.failed, seen.tried
     scores = np.asarray(step.scores, np.float32)
-    if scores.shape != tried.shape or not np.all((scores >= 0) & (scores <= 1)):
-        bad = (
-            ""
-            if scores.shape != tried.shape
-            else f", {np.sum(~((scores >= 0) & (scores <= 1)))} elsewhere"
-        )
+    outside = ~((scores >= 0) & (scores <= 1))
+    if scores.shape != tried.shape or outside.any():
+        bad = f", {outside.sum()} elsewhere" if scores.shape == tried.shape else ""
         raise ValueError(
             f"validate: the selector's scores must be [{len(tried)}] in [0, 1], received shape"
             f" {scores.shape}{bad}"
