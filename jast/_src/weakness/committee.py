@@ -57,18 +57,13 @@ def fit(rng, x, targets, weights, classes, passes):
     order = np.concatenate(
         [rng.permutation(n)[: n // batch * batch].reshape(-1, batch) for _ in range(epochs)]
     )[:steps].astype(np.int32)
-    first, second = (
-        rng.standard_normal(shape, np.float32) * np.float32(scale)
-        for shape, scale in (
-            ((d, members, HIDDEN), np.sqrt(2 / d)),
-            ((members, HIDDEN, classes), np.sqrt(1 / HIDDEN)),
-        )
-    )
+    first = rng.standard_normal((d, members, HIDDEN), np.float32)
+    second = rng.standard_normal((members, HIDDEN, classes), np.float32)
     start = Committee(
-        first,
-        np.zeros((members, HIDDEN), np.float32),
-        second,
-        np.zeros((members, classes), np.float32),
+        first=first * np.float32(np.sqrt(2 / d)),
+        first_bias=np.zeros((members, HIDDEN), np.float32),
+        second=second * np.float32(np.sqrt(1 / HIDDEN)),
+        second_bias=np.zeros((members, classes), np.float32),
     )
     return _fit(start, x, targets.astype(np.int32), weights.astype(np.float32), order)
 

@@ -68,16 +68,11 @@ def influence(
         )
     at = at.astype(int)
     tried = result.predicted >= 0
+    answers = np.where(tried, result.predicted, data.labels)
     weights = np.tile(np.where(tried, STRENGTH, 1), (MEMBERS, 1))
     rng = numpy_generator(key)
     x = centre(scale_inputs(data), data.image)
-    imitation = committee.fit(
-        rng,
-        x,
-        np.where(tried, result.predicted, data.labels),
-        weights,
-        data.classes,
-        EFFORT * PASSES[data.image],
-    )
+    passes = EFFORT * PASSES[data.image]
+    imitation = committee.fit(rng, x, answers, weights, data.classes, passes)
     slope = np.asarray(committee.failure_gradient(imitation, x[at], data.labels[at]))
     return (slope * (x[at] - x.mean(0))).reshape(-1, *data.inputs.shape[1:])

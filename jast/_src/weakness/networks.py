@@ -157,11 +157,8 @@ def _fit(key, params, data, apply, *, epochs, rate, loss, batch):
         return params, state, total + value * jnp.sum(weight)
 
     def epoch(carry, key):
-        order = number[
-            jnp.argsort(
-                jnp.where(place < size, jax.random.uniform(key, place.shape, jnp.float32), 2.0)
-            )
-        ]
+        drawn = jax.random.uniform(key, place.shape, jnp.float32)
+        order = number[jnp.argsort(jnp.where(place < size, drawn, 2.0))]
         params, state, total = lax.fori_loop(
             0, steps, functools.partial(step, order=order), (*carry, jnp.zeros((), jnp.float32))
         )

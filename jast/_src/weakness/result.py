@@ -152,12 +152,10 @@ class Result(NamedTuple):
             f"{i:9d} {c:7d} {f:8d} {_number(p):>10} {_number(r):>9} {_number(a):>7} {e:9.0f}"
             for i, (c, f, p, r, a, e) in enumerate(rows, 1)
         )
-        left = (
-            ""
-            if np.isnan(self.expected)
-            else f"; roughly {self.expected:.0f} expected among the {n - self.calls} not run"
-            + ROUGH * (json.loads(self.state.selector)[0] == "default")
-        )
+        left = ""
+        if not np.isnan(self.expected):
+            left = f"; roughly {self.expected:.0f} expected among the {n - self.calls} not run"
+            left += ROUGH * (json.loads(self.state.selector)[0] == "default")
         head = f"{len(self.failures)} failures in {self.calls} calls ({n} inputs){left}"
         names = (
             "iteration   calls failures  precision   ~recall AUC run ~expected\n" if table else ""

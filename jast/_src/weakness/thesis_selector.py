@@ -182,20 +182,13 @@ def _train_adversary(key, params, codes, lesson, seen, copies, epochs, rate):
 def _flat(params):
     from flax.traverse_util import flatten_dict
 
-    return {
-        ADVERSARY + name: np.asarray(array) for name, array in flatten_dict(params, sep="/").items()
-    }
+    flat = flatten_dict(params, sep="/")
+    return {ADVERSARY + name: np.asarray(array) for name, array in flat.items()}
 
 
 def adversary_of(memory):
     """The adversary's parameters in the ``memory`` of a state."""
     from flax.traverse_util import unflatten_dict
 
-    return unflatten_dict(
-        {
-            name.removeprefix(ADVERSARY): array
-            for name, array in memory.items()
-            if name.startswith(ADVERSARY)
-        },
-        sep="/",
-    )
+    own = [name for name in memory if name.startswith(ADVERSARY)]
+    return unflatten_dict({name.removeprefix(ADVERSARY): memory[name] for name in own}, sep="/")

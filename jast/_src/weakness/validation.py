@@ -237,10 +237,8 @@ def _run(state, selector, data, predict, budget, store, progress, callback):
             idle = 0 if len(current.order) > len(seen.order) else idle + 1
             row = _row(history, step, current)
             # those that an interrupted iteration had asked for, and this one has not, come last
-            order = (
-                current.order.tolist()
-                + np.asarray(answered, int)[~current.tried[answered]].tolist()
-            )
+            others = np.asarray(answered, int)[~current.tried[answered]]
+            order = current.order.tolist() + others.tolist()
             seen, memory, history, answered = current, step.memory, row, order
             watch.tell(lambda: _result(kept(), data, ()))
             if idle == IDLE:
