@@ -100,11 +100,8 @@ def sierra(
     paths = jnp.asarray(_PATHS[order][None, :, None], dtype)
     ways = jnp.asarray(np.array([1, -1])[None, None, :, None], dtype)
     around = (spacing * corners + variance * ways * paths).reshape(-1, 2)
-    spread = (
-        jnp.broadcast_to(jnp.arange(1, 7, dtype=dtype)[None, :, None] ** decay, (4, 6, 2)).ravel()
-        * variance
-        / sharpness
-    )
+    fading = jnp.arange(1, 7, dtype=dtype)[None, :, None] ** decay
+    spread = jnp.broadcast_to(fading, (4, 6, 2)).ravel() * variance / sharpness
     means = jnp.concatenate([mean[None], mean[None] + around])
     variances = jnp.concatenate([1 / sharpness[None], spread])  # Sigma / (sigma eta) = I / eta
     return Partial(_log_sierra if log else _sierra, means, variances)
@@ -142,11 +139,8 @@ def branin(x: Array) -> Array:
         0.3979
     """
     x1, x2 = _vector("branin", x, 2)
-    return (
-        (x2 - 5.1 / (4 * math.pi**2) * x1**2 + 5 / math.pi * x1 - 6) ** 2
-        + 10 * (1 - 1 / (8 * math.pi)) * jnp.cos(x1)
-        + 10
-    )
+    valley = (x2 - 5.1 / (4 * math.pi**2) * x1**2 + 5 / math.pi * x1 - 6) ** 2
+    return valley + 10 * (1 - 1 / (8 * math.pi)) * jnp.cos(x1) + 10
 
 
 def ackley(x: Array) -> Array:

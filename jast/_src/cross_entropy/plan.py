@@ -97,17 +97,13 @@ def make_plan(
     ).items():
         if not isinstance(value, bool):
             raise ValueError(f"{method}: {name} must be True or False, received {value!r}")
-    given_optimism = chosen.get("optimism", 0.0)
     positive = (lambda v: 0 < v < math.inf), "above 0"
     other = (lambda v: 0 <= v < math.inf), "of at least 0"
-    numbers = [
-        real_number(method, name, chosen.pop(name, default), *check)
-        for name, default, check in (
-            ("alpha", 1.0, positive),
-            ("optimism", 0.0, other),
-            ("regularisation", 0.0, other),
-        )
-    ]
+    numbers = (
+        real_number(method, "alpha", chosen.get("alpha", 1.0), *positive),
+        real_number(method, "optimism", chosen.get("optimism", 0.0), *other),
+        real_number(method, "regularisation", chosen.get("regularisation", 0.0), *other),
+    )
     if method == "ce_mixture":
         proposal = _first_mixture(
             method, proposal, max(kept), chosen["components"], given.get("components")
@@ -117,15 +113,13 @@ def make_plan(
         proposal = as_gaussian(proposal)
     mean = jax.tree.leaves(proposal)[-2]
     if method != "ce_method":
-        chosen |= _surrogate_plan(
-            method, chosen, given_optimism, max(sizes), mean_size, kept, mean.shape[-1]
-        )
+        chosen |= _surrogate_plan(method, chosen, max(sizes), mean_size, kept, mean.shape[-1])
     settings = Settings(*(value.astype(mean.dtype) for value in numbers))
     static = {name: value for name, value in chosen.items() if name in Plan._fields}
     return Plan(method, sizes, tuple(kept), **static), settings, proposal
 
 
-def _surrogate_plan(method, chosen, optimism, most, each, kept, d):
+def _surrogate_plan(method, chosen, most, each, kept, d):
     """The static settings of a surrogate, as `Plan` has them; ``most``, ``each``: the evaluations
     of the largest and of the mean iteration.
     """
@@ -139,7 +133,7 @@ def _surrogate_plan(method, chosen, optimism, most, each, kept, d):
         evaluated=min(math.ceil(round(float(share) * most, 9)), max(kept), most // 2),
         memory=whole_number(method, "memory", chosen["memory"], 1),
         best=whole_number(method, "best", chosen["best"], 0),
-        optimistic=is_traced(optimism) or bool(optimism != 0),
+        optimistic=is_traced(chosen["optimism"]) or bool(chosen["optimism"] != 0),
         judged=judged,
         sub=(10 * elites, elites, 2),
         chosen=tuple(

@@ -79,12 +79,8 @@ class CEResult(NamedTuple):
         if value.ndim == 0:
             done = ~np.isnan(self.history.x).any(axis=1)  # of a search that is not at its end
             evaluations = np.cumsum(np.bincount(self.history.iteration[done]))
-            rows = zip(
-                evaluations,
-                np.asarray(self.history.best_value),
-                np.asarray(self.history.best_x),
-                strict=False,
-            )
+            best = np.asarray(self.history.best_value), np.asarray(self.history.best_x)
+            rows = zip(evaluations, *best, strict=False)
             table = "\n".join(
                 f"{i:9d} {evaluations:11d} {b:14.6g}   {_point(x)}"
                 for i, (evaluations, b, x) in enumerate(rows, 1)

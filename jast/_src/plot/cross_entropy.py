@@ -20,7 +20,11 @@ __all__ = ["convergence", "proposal_contours", "surrogate_samples"]
 
 GRID = 121  # points of a side
 LEVELS = 12  # shades of the objective
-EDGE = dict(markeredgecolor=style.INK, markeredgewidth=0.7)
+EDGE = dict(linestyle="", markeredgecolor=style.INK, markeredgewidth=0.7)
+EVALUATED = EDGE | dict(marker="o", markersize=5, color="white", markeredgewidth=1.0, zorder=5)
+ELITES = EDGE | dict(marker="D", markersize=5.5, color=style.ORANGE, zorder=6)
+JUDGED = EDGE | dict(marker=".", markersize=6, color=style.ORANGE, markeredgewidth=0.5, zorder=4)
+BEST = EDGE | dict(marker="*", markersize=13, color=style.VERMILION, zorder=7)
 DEVIATIONS = {1: "-", 2: style.DASHED}  # lines of the ellipses
 SHADES = ("#2F70A6", "#7FAFD3", "#BFD7E9", "#EDF2F6")
 
@@ -78,13 +82,12 @@ def proposal_contours(
     settings = dict(sharex=False, layout="compressed")
     with style.panels(caller, axes, size, count, "iteration", columns, **settings) as panels:
         for i, (ax, k, box) in enumerate(zip(panels, chosen, boxes, strict=True)):
-            now, best = drawn[i]
             _ground(ax, objective, box, log.x.dtype)
             _proposal(ax, result, k - 1)
-            _points(ax, now, "evaluated in\nthe iteration")
-            look = dict(linestyle="", marker="D", markersize=5.5, color=style.ORANGE, **EDGE)
-            ax.plot(*best.T, label=f"the {elites} best so far", zorder=6, **look)
-            _star(ax, log.best_x[k - 1])
+            now, best = drawn[i]
+            ax.plot(*now.T, label="evaluated in\nthe iteration", **EVALUATED)
+            ax.plot(*best.T, label=f"the {elites} best so far", **ELITES)
+            ax.plot(*log.best_x[k - 1], label="best so far", **BEST)
             _outside(ax, now, box)
             ax.set_title(f"iteration {k}")
             if i % columns == 0:
@@ -141,19 +144,17 @@ def surrogate_samples(
     [box] = _boxes(caller, bounds, [np.concatenate([near, log.best_x[k - 1 : k]])])
     settings = dict(sharey=True, layout="compressed")
     with style.panels(caller, axes, (8.6, 3.5), 2, "kind of sample", 2, **settings) as panels:
-        for ax, which in zip(panels, (k - 1, k), strict=True):
+        left, right = panels
+        for ax, which, points, label, look, title in (
+            (left, k - 1, now, "truly evaluated", EVALUATED, "truly evaluated"),
+            (right, k, judged, "judged by\nthe surrogate", JUDGED, "judged; next proposal"),
+        ):
             _ground(ax, objective, box, log.x.dtype)
             _proposal(ax, result, which)
-            ax.set_xlabel("$x_1$")
-        left, right = panels
-        _points(left, now, "truly evaluated")
-        look = dict(linestyle="", marker=".", markersize=6, color=style.ORANGE, **EDGE)
-        look |= dict(markeredgewidth=0.5)
-        right.plot(*judged.T, **look, label="judged by\nthe surrogate", zorder=4)
-        titles = (now, "truly evaluated"), (judged, "judged; next proposal")
-        for ax, (points, title) in zip(panels, titles, strict=True):
-            _star(ax, log.best_x[k - 1])
+            ax.plot(*points.T, label=label, **look)
+            ax.plot(*log.best_x[k - 1], label="best so far", **BEST)
             _outside(ax, points, box)
+            ax.set_xlabel("$x_1$")
             ax.set_title(f"{len(points)} {title}")
         left.set_ylabel("$x_2$")
         _legend(right, objective, left)
@@ -197,11 +198,9 @@ def convergence(
         )
     for name, result in results.items():
         if not isinstance(result, CEResult) or np.ndim(result.best_value) != 1:
-            received = (
-                f"leading axes {np.shape(result.best_value)}"
-                if isinstance(result, CEResult)
-                else type(result).__name__
-            )
+            received = type(result).__name__
+            if isinstance(result, CEResult):
+                received = f"leading axes {np.shape(result.best_value)}"
             raise ValueError(
                 f"plot.{caller}: results must be CEResults with one leading axis, received"
                 f" {received}{f' for {name!r}' if name else ''}"
@@ -357,16 +356,6 @@ def _proposal(ax, result, k):
             look = dict(fill=False, edgecolor=style.VERMILION, linewidth=width, linestyle=line)
             look |= dict(alpha=float(strength), zorder=3)
             ax.add_patch(Ellipse(mean, *deviations * sides, angle=angle, **look))
-
-
-def _points(ax, x, label):
-    look = EDGE | dict(linestyle="", marker="o", markersize=5, color="white", markeredgewidth=1.0)
-    ax.plot(*x.T, label=label, zorder=5, **look)
-
-
-def _star(ax, x):
-    look = dict(linestyle="", marker="*", markersize=13, color=style.VERMILION, **EDGE)
-    ax.plot(*x, label="best so far", zorder=7, **look)
 
 
 def _outside(ax, x, box):
