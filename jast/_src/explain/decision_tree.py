@@ -78,21 +78,13 @@ def read_rules(tree, features, names, leaf, truth, level) -> tuple:
             if k:
                 here, own = leaf == node, truth == k
                 hits = int(np.sum(here & own))
-                precision, precise = share_of(hits, int(here.sum()), level)
-                recall, recalled = share_of(hits, int(own.sum()), level)
+                precision = share_of(hits, int(here.sum()), level)
+                recall = share_of(hits, int(own.sum()), level)
                 conditions = tuple(
                     (features[i].name, features[i].kind, low, high)
                     for i, (low, high) in bounds.items()
                 )
-                rule = Rule(
-                    label=names[k],
-                    conditions=conditions,
-                    precision=precision,
-                    precision_interval=precise,
-                    recall=recall,
-                    recall_interval=recalled,
-                )
-                found.append(rule)
+                found.append(Rule(names[k], conditions, *precision, *recall))
             return
         i, cut = int(t.feature[node]), float(t.threshold[node])
         low, high = bounds.get(i, (-np.inf, np.inf))

@@ -184,7 +184,7 @@ def eigenfailures(
         mean=mean,
         names=tuple(number_names(sim)),
         steps=number_steps(sim),
-        end=int(length.max()),
+        end=last,
         middle=middle,
         minus=minus,
         plus=plus,

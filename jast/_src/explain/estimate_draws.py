@@ -62,11 +62,8 @@ def free_undecided(
     model has them.
     """
     signature = signature_of(sim)
-    whole = [
-        np.issubdtype(leaf.dtype, np.integer)
-        for leaf in jax.tree.leaves((signature.x0, signature.x))
-    ]
-    if any(whole):
+    leaves = jax.tree.leaves((signature.x0, signature.x))
+    if any(np.issubdtype(leaf.dtype, np.integer) for leaf in leaves):
         chance = transform.side_by_side(sim, partial(_chances, sim), z, lanes=LANES)
         u = np.asarray(ndtr(-np.abs(z)))
         u = u + chance * (rng.random(z.shape) - 0.5)

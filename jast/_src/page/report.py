@@ -210,12 +210,12 @@ def _modes(
 def _card(number: int, facts: list, data: dict, explanations: list) -> str:
     """One mode; the script fills the elements that have a class and no words."""
     words = "".join(f"<pre>{text(one)}</pre>" for one in explanations)
-    held = (
-        "<p><button class=copy>Copy JSON</button> <button class=download>Download"
-        f" failure-{number}.json</button></p><pre class=json></pre>"
-        if data["exact"] is not None
-        else "<p>Too many for this page: they are in the saved report.</p>"
-    )
+    held = "<p>Too many for this page: they are in the saved report.</p>"
+    if data["exact"] is not None:
+        held = (
+            "<p><button class=copy>Copy JSON</button> <button class=download>Download"
+            f" failure-{number}.json</button></p><pre class=json></pre>"
+        )
     return (
         f'<article class=card id="mode-{number}" data-mode="{number - 1}">'
         f"<h3>Mode {number}</h3>{rows(facts, 'facts wide')}"

@@ -329,13 +329,9 @@ def zone_outline(zone, n, e, course, points=200):
 
 def _place(ahead, right, east, north, heading):
     """[points, 2] in (east, north): points ahead and to the right of a place on a heading."""
-    return np.stack(
-        [
-            east + ahead * np.sin(heading) + right * np.cos(heading),
-            north + ahead * np.cos(heading) - right * np.sin(heading),
-        ],
-        -1,
-    )
+    e = east + ahead * np.sin(heading) + right * np.cos(heading)
+    n = north + ahead * np.cos(heading) - right * np.sin(heading)
+    return np.stack([e, n], -1)
 
 
 def _limits(log, moments):

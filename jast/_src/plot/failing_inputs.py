@@ -68,11 +68,9 @@ def first_failures(
             f"plot.{caller}: inputs must be those of the result, {n}, received {len(inputs)}"
         )
     if inputs.ndim not in (3, 4) or inputs.ndim == 4 and inputs.shape[3] not in (1, 3, 4):
-        received = (
-            f"rows of a table, shape {inputs.shape}: reshape them if they are images"
-            if inputs.ndim == 2
-            else f"shape {inputs.shape}"
-        )
+        received = f"shape {inputs.shape}"
+        if inputs.ndim == 2:
+            received = f"rows of a table, {received}: reshape them if they are images"
         raise ValueError(
             f"plot.{caller}: inputs must be images [n, height, width] or [n, height, width, 1, 3 or"
             f" 4 channels], received {received}"

@@ -114,7 +114,7 @@ def report(
         _draw_title(page, title, headline(report)[1])
         page.y = MARGIN + top
         _draw_probability(page, told, left)
-        _draw_facts(page, right, MARGIN + 3.75, 1.0)
+        _draw_rows(page, right, MARGIN + 3.75, 1.0)
         page.y = MARGIN + top + facts
         if shown:
             _draw_modes(page, report, sim, shown, nominal, units)
@@ -190,21 +190,24 @@ def _draw_probability(page: _Page, told: Any, rows: list) -> None:
     if told.doubt:
         look = dict(color=style.GREY, fontsize=13)
     page.words(MARGIN, told.value, 0.23, **look)
+    _draw_rows(page, rows, MARGIN, 1.5, 0.66, told.mood)
+
+
+def _draw_rows(
+    page: _Page, rows: list, x: float, indent: float, down: float = 0.0, mood: str = "unknown"
+) -> None:
+    """Rows of a name and a line: "!" is a line in the colour of the ``mood``, "" and ">" are lines
+    without a name.
+    """
     for i, (name, words) in enumerate(rows):
-        down = 0.66 + LINE * i
+        at = down + LINE * i
         if name == "!":
-            page.words(MARGIN, words, down, fontsize=9, weight="bold", color=MOODS[told.mood])
+            page.words(x, words, at, fontsize=9, weight="bold", color=MOODS[mood])
         elif name in ("", ">"):
-            page.words(MARGIN + 0.1 * (name == ">"), words, down, fontsize=8.5)
+            page.words(x + 0.1 * (name == ">"), words, at, fontsize=8.5)
         else:
-            page.words(MARGIN, name or "", down, fontsize=8.5, color=style.GREY)
-            page.words(MARGIN + 1.5, words, down, fontsize=8.5)
-
-
-def _draw_facts(page: _Page, rows: list, x: float, indent: float) -> None:
-    for i, (name, words) in enumerate(rows):
-        page.words(x, name or "", LINE * i, fontsize=8.5, color=style.GREY)
-        page.words(x + indent, words, LINE * i, fontsize=8.5)
+            page.words(x, name or "", at, fontsize=8.5, color=style.GREY)
+            page.words(x + indent, words, at, fontsize=8.5)
 
 
 def _draw_modes(page: _Page, report: Any, sim: Any, shown: list, nominal: Any, units: Any) -> None:

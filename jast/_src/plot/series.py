@@ -96,14 +96,12 @@ def samples_of(caller: str, samples: Any, sim: Any, modes: Any, most: int) -> Sa
     if isinstance(samples, Episode) and not np.ndim(samples.length):
         samples = jax.tree.map(lambda a: a[None], samples)
     if not isinstance(samples, Episode) or np.ndim(samples.length) != 1 or not len(samples.length):
-        axes = (
-            f"leading axes {np.shape(samples.length)}"
-            if isinstance(samples, Episode)
-            else f"a {type(source).__name__} without any"
-        )
+        received = f"a {type(source).__name__} without any"
+        if isinstance(samples, Episode):
+            received = f"leading axes {np.shape(samples.length)}"
         raise ValueError(
             f"plot.{caller}: samples must be failures (a report, modes, a result of a search,"
-            f" FailureSamples) or Episodes with one leading axis, received {axes}"
+            f" FailureSamples) or Episodes with one leading axis, received {received}"
         )
     n = len(samples.length)
     rows = np.unique(np.linspace(0, n - 1, min(most, n)).round().astype(int))
