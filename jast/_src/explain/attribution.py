@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any, Literal, NamedTuple
 
 import jax
@@ -29,6 +28,7 @@ __all__ = ["Attribution", "attribution"]
 POINTS = 128  # on the way from the mode to the episode
 HOSTED_BUDGET = 1000  # evaluations of a black box by default
 PRINTED = 10  # disturbances
+METHODS = "shapley", "integrated", "gradient"
 
 
 @display.printable()
@@ -132,9 +132,14 @@ def attribution(
             f"{name}: sim must have a finite miss distance when it is undisturbed, received {quiet}"
         )
     total = float(quiet - g.outcome.distance[0])
+    error, cost = np.zeros(len(g.v)), 0
     if method == "shapley":
         permutations = _affordable(g, permutations, budget)
-    values, error, cost = METHODS[method](g, float(quiet), key, permutations)
+        values, error = _shapley(g, float(quiet), key, permutations)
+    elif method == "integrated":
+        values, cost = _integrated(g), 4 * POINTS
+    else:
+        values, cost = _gradient(g), 4
     x0, shaped = like_disturbances(g.sim, values)
     steps, called = number_steps(g.sim), number_names(g.sim)
     live = np.flatnonzero(g.v)
@@ -176,7 +181,7 @@ def _shapley(g: EpisodePoint, quiet: float, key: jax.Array, permutations: int):
     d, pairs = len(live), -(-permutations // 2)
     seen = np.zeros((pairs, len(g.v)))
     if not d:
-        return seen[0], seen[0], 0
+        return seen[0], seen[0]
     for i in range(pairs):
         order = rng.permutation(live)
         for one in (order, order[::-1]):
@@ -186,17 +191,17 @@ def _shapley(g: EpisodePoint, quiet: float, key: jax.Array, permutations: int):
             along = np.concatenate([[quiet], _checked_finite(g.evaluate(points).distance)])
             seen[i, one] -= np.diff(along) / 2
     error = seen.std(axis=0, ddof=1) / np.sqrt(pairs) if pairs > 1 else np.full(len(g.v), np.nan)
-    return seen.mean(axis=0), error, 0
+    return seen.mean(axis=0), error
 
 
-def _integrated(g: EpisodePoint, quiet: float, key: jax.Array, permutations: int):
+def _integrated(g: EpisodePoint) -> np.ndarray:
     """By the midpoint rule on the way from 0 to the episode."""
     shares = (np.arange(POINTS) + 0.5) / POINTS
     slopes = _gradients(g, shares[:, None] * g.v)
-    return -slopes.mean(axis=0) * g.v, np.zeros(len(g.v)), 4 * POINTS
+    return -slopes.mean(axis=0) * g.v
 
 
-def _gradient(g: EpisodePoint, quiet: float, key: jax.Array, permutations: int):
+def _gradient(g: EpisodePoint) -> np.ndarray:
     """Just outside of the failures, where the distance is not yet flat."""
     shares = 1 - np.geomspace(1e-5, 1, 2 * POINTS)
     outside = shares[~g.evaluate(shares[:, None] * g.v).failure]
@@ -206,14 +211,7 @@ def _gradient(g: EpisodePoint, quiet: float, key: jax.Array, permutations: int):
             ' from the mode to the episode, and there is none; expected method="shapley" here'
         )
     slopes = _gradients(g, outside.max() * g.v[None])[0]
-    return -slopes * np.sign(g.v), np.zeros(len(g.v)), 4
-
-
-METHODS: dict[str, Callable] = {
-    "shapley": _shapley,
-    "integrated": _integrated,
-    "gradient": _gradient,
-}
+    return -slopes * np.sign(g.v)
 
 
 def _gradients(g: EpisodePoint, points: np.ndarray) -> np.ndarray:

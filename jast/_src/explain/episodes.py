@@ -41,7 +41,6 @@ class FullEpisodes(NamedTuple):
     x0: Any
     disturbances: Any
     """[n, horizon, ...]: behind the end of an episode what the model would have drawn on."""
-    length: np.ndarray
     states: Any
     """[n, horizon + 1, ...]; random keys are left out."""
     evaluations: int
@@ -129,12 +128,10 @@ def play_to_horizon(
     """
     n = len(e.length)
     if not states and (e.length == sim.horizon).all():
-        return FullEpisodes(
-            x0=e.x0, disturbances=e.disturbances, length=e.length, states=None, evaluations=0
-        )
+        return FullEpisodes(x0=e.x0, disturbances=e.disturbances, states=None, evaluations=0)
     rows = np.arange(n, dtype=np.int32), e.x0, e.disturbances, e.length
     x, s = side_by_side(sim, partial(_played_on, sim, key), *rows, lanes=LANES)
-    return FullEpisodes(x0=e.x0, disturbances=x, length=e.length, states=s, evaluations=n)
+    return FullEpisodes(x0=e.x0, disturbances=x, states=s, evaluations=n)
 
 
 @jit
