@@ -11,7 +11,7 @@ from jast._src.cross_entropy.gaussian import Gaussian
 from jast._src.cross_entropy.mixture import Mixture
 from jast._src.util import display
 
-__all__ = ["CEResult", "History", "Scores", "scores"]
+__all__ = ["CEResult", "History", "Scores", "scores", "standard_error"]
 
 
 @display.printable()
@@ -164,10 +164,14 @@ def scores(result: CEResult, optimum: Array | None) -> Scores:
     optimum = np.asarray(optimum, float)
     if optimum.shape != x.shape[2:]:
         raise ValueError(f"scores: optimum must be [{x.shape[2]}], received shape {optimum.shape}")
-    runs = len(x)
     distance = np.sqrt(np.sum((x - optimum) ** 2, axis=2))
-    error = (
-        value.std(axis=0, ddof=1) / np.sqrt(runs) if runs > 1 else np.full(value.shape[1], np.nan)
-    )
     rms = np.sqrt(np.mean(distance**2, axis=0))
+    error = standard_error(value)
     return Scores(value.mean(axis=0), error, distance.mean(axis=0), rms, np.sqrt(50) * rms)
+
+
+def standard_error(rows):
+    """[K]: of the mean over the runs of ``rows`` [runs, K]; NaN for one run."""
+    if len(rows) == 1:
+        return np.full(rows.shape[1], np.nan)
+    return rows.std(axis=0, ddof=1) / np.sqrt(len(rows))

@@ -3,6 +3,7 @@ to the last bit.
 """
 
 import inspect
+import math
 from collections.abc import Callable
 from json import dumps
 from typing import Any
@@ -39,7 +40,8 @@ def trace(sim: Simulator | None, episode: Episode, quiet: Episode | None, most: 
     played = None if sim is None else _played(sim, episode)
     whole = jax.tree.map(_numbers, played)
     n = int(episode.length)
-    width = sum(min(ENTRIES, _size(a)) for a in jax.tree.leaves((whole, episode.disturbances)))
+    leaves = jax.tree.leaves((whole, episode.disturbances))
+    width = sum(min(ENTRIES, math.prod(np.shape(a)[1:])) for a in leaves)
     stride = max(1, -(-(n + 1) * 2 * max(width, 1) // most))
     steps = sorted({*range(0, n + 1, stride), n})
     found = {"steps": steps, "length": n, "x": groups(episode.disturbances, steps, "x", late=1)}
@@ -196,7 +198,3 @@ def _takes_past(draw: Callable[..., str]) -> bool:
 def _length(fragment: str) -> int:
     """In the file."""
     return len(dumps(fragment, ensure_ascii=False).encode())
-
-
-def _size(a: Any) -> int:
-    return int(np.prod(np.shape(a)[1:]))

@@ -67,9 +67,9 @@ def nodes_of(caller: str, result: Any, tree: int | None = None) -> Nodes:
     found = jax.tree.map(np.asarray, found)
     made, trees = found.visits > 0, found.visits.shape[1]
     value = np.where(made & np.isfinite(found.reward), found.reward, -np.inf)
-    rank = np.where((made & found.failure).any(0), np.where(found.failure, value, -np.inf), value)
+    failed = (made & found.failure).any(0)
+    rank = np.where(failed, np.where(found.failure, value, -np.inf), value)
     if tree is None:
-        failed = (made & found.failure).any(0)
         tree = int(np.lexsort((rank.max(0), failed))[-1])
     if isinstance(tree, bool) or not isinstance(tree, int | np.integer) or not 0 <= tree < trees:
         raise ValueError(f"{caller}: tree must be in 0 .. {trees - 1}, received {tree!r}")

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
-from jast._src.core.episode import Episode, replay
+from jast._src.core.episode import Episode
 from jast._src.core.simulator import Simulator
 from jast._src.core.typing import PathLike
 from jast._src.plot import style
@@ -282,18 +282,12 @@ class _Panel:
 
 def _states(caller, episode, sim):
     """s_0 .. s_length as NumPy arrays."""
-    states = style.one_episode(caller, episode).states
-    if states is None and sim is None:
+    if style.one_episode(caller, episode).states is None and sim is None:
         raise ValueError(
             f"plot.{caller}: episode must have states, or sim be the simulator to replay it on,"
             " received neither"
         )
-    states = replay(sim, episode).states if states is None else states
-    if not isinstance(states, ColavState):
-        raise ValueError(
-            f"plot.{caller}: episode must be of jast.simulators.colav, received states of"
-            f" {type(states).__name__}"
-        )
+    states = style.states_of(caller, episode, sim, "colav", ColavState)
     return jax.tree.map(lambda a: np.asarray(a)[: int(episode.length) + 1], states)
 
 

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jast._src.core.typing import Objective
+from jast._src.cross_entropy.result import standard_error
 from jast._src.plot import style
 from jast._src.plot.style import Axes
 from jast.cross_entropy import CEResult, Mixture, scores
@@ -218,7 +219,8 @@ def convergence(
             quantities = [(score.best_value, score.standard_error)]
             if optimum is not None:
                 away = np.asarray(history.best_x, float) - np.asarray(optimum, float)
-                quantities.append((score.mean_distance, _standard_error(away)))
+                error = standard_error(np.linalg.norm(away, axis=2))
+                quantities.append((score.mean_distance, error))
             look = dict(color=style.colour(i), marker=style.marker(i), markersize=4.5)
             look |= dict(label=name or f"mean of {runs} runs")
             for ax, (mean, error) in zip(panels, quantities, strict=True):
@@ -236,14 +238,6 @@ def convergence(
             _plain(panels[1])
         panels[0].legend(loc="best")
     return panels
-
-
-def _standard_error(away):
-    """[n] of the mean distance over runs, of ``away`` [runs, n, d]; NaN for one run."""
-    distance = np.linalg.norm(away, axis=2)
-    if len(distance) == 1:
-        return np.full(distance.shape[1], np.nan)
-    return distance.std(0, ddof=1) / np.sqrt(len(distance))
 
 
 class _Log:

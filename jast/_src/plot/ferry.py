@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from jast._src.core.episode import Episode, replay
+from jast._src.core.episode import Episode
 from jast._src.core.simulator import Simulator
 from jast._src.plot import style
 from jast._src.plot.style import Axes
@@ -32,14 +32,8 @@ def ferry(episode: Episode, sim: Simulator | None = None, ax: Axes | None = None
     """
     from matplotlib.patches import Circle
 
-    states = style.one_episode("ferry", episode).states
-    if states is None:
-        states = replay(ferry_simulator() if sim is None else sim, episode).states
-    if not isinstance(states, FerryState):
-        raise ValueError(
-            "plot.ferry: episode must be of jast.simulators.ferry, received states of"
-            f" {type(states).__name__}"
-        )
+    sim = ferry_simulator() if sim is None else sim
+    states = style.states_of("ferry", episode, sim, "ferry", FerryState)
     n = int(episode.length)
     paths = [
         np.stack([x, y], -1)[: n + 1]

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, NewType
 
 import numpy as np
 
-from jast._src.core.episode import Episode
+from jast._src.core.episode import Episode, replay
 
 if TYPE_CHECKING:
     from matplotlib.animation import FuncAnimation
@@ -59,6 +59,7 @@ __all__ = [
     "panels",
     "plain",
     "shade",
+    "states_of",
     "styled",
     "unframed",
     "whole_steps",
@@ -171,6 +172,20 @@ def one_episode(caller, episode):
         )
         raise ValueError(f"plot.{caller}: episode must be one Episode, received {received}")
     return episode
+
+
+def states_of(caller, episode, sim, system, kind):
+    """The states of one episode of the ``system`` of `jast.simulators`, replayed on ``sim`` where
+    it has none; a ValueError where they are not of the ``kind`` of that system.
+    """
+    states = one_episode(caller, episode).states
+    states = replay(sim, episode).states if states is None else states
+    if not isinstance(states, kind):
+        raise ValueError(
+            f"plot.{caller}: episode must be of jast.simulators.{system}, received states of"
+            f" {type(states).__name__}"
+        )
+    return states
 
 
 def checked_kind(caller, name, value, kind, words):

@@ -48,8 +48,7 @@ def failures_found(
         >>> ax = jast.plot.failures_found(found, wrong(inputs) != labels)
     """
     caller = "failures_found"
-    rows = _rows(caller, results)
-    n = _same_n(caller, rows)
+    rows, n = _rows(caller, results)
     truth = None if failed is None else measures.checked_truth(f"plot.{caller}", failed, n)
     for result in [] if truth is None else [result for row in rows.values() for result in row]:
         wrong = int(np.sum(truth[result.order] != _hits(result)))
@@ -161,26 +160,21 @@ def checked_result(caller, result):
 
 
 def _rows(caller, results):
-    """Name -> list of `Result`s, or a ValueError. A `Result` is a tuple, so a tuple is no list
-    here.
+    """Name -> list of `Result`s, and their number of inputs, or a ValueError. A `Result` is a
+    tuple, so a tuple is no list here.
     """
     rows = style.by_name(results)
     rows = {name: row if isinstance(row, list) else [row] for name, row in rows.items()}
     every = [result for row in rows.values() for result in row]
     words = "a jast.weakness.Result, a list of them or a dict of name -> either"
     style.checked_kinds(caller, "results", every if all(rows.values()) else (), Result, words)
-    return rows
-
-
-def _same_n(caller, rows):
-    """The number of inputs, or a ValueError where the results differ in it."""
-    sizes = sorted({len(result.scores) for row in rows.values() for result in row})
+    sizes = sorted({len(result.scores) for result in every})
     if len(sizes) > 1:
         raise ValueError(
             f"plot.{caller}: results must be of the same inputs, received results of"
             f" {', '.join(map(str, sizes))} inputs"
         )
-    return sizes[0]
+    return rows, sizes[0]
 
 
 def _hits(result):

@@ -16,6 +16,7 @@ from jast._src.core.typing import Array, Callback, PathLike, Predict, PRNGKey
 from jast._src.runtime.checkpoints import open_checkpoint
 from jast._src.runtime.progress_bar import Watch, terminable
 from jast._src.util.checks import check_random_key, whole_number
+from jast._src.weakness import selectors
 from jast._src.weakness.data import are_indices, check_data, fingerprint
 from jast._src.weakness.measures import auc
 from jast._src.weakness.result import History, Result, State
@@ -116,8 +117,6 @@ def validate(
 
 
 def _selector(selector):
-    from jast._src.weakness import selectors
-
     if isinstance(selector, Selector):
         return selector
     if not isinstance(selector, str) or selector not in selectors.NAMES:
