@@ -93,8 +93,7 @@ def encoded(result: Result, inputs: Array, labels: Array, *, classes: int | None
     if name != "thesis":
         raise ValueError(f"encoded: result must be of the selector thesis, received one of {name}")
     first, _ = jax.random.split(iteration_key(result.state.key, 0))
-    how = (settings[name] for name in ("hidden", "encoder_epochs", "encoder_rate", "batch"))
-    hidden, params, _ = train_encoder(first, scale_inputs(data), *how)
+    hidden, params, _ = train_encoder(first, scale_inputs(data), settings)
     memory = result.state.memory
     adversary = adversary_of(memory)
     codes = np.asarray(memory["codes"])

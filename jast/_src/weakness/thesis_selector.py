@@ -70,33 +70,24 @@ def thesis(
         3
     """
     whole = functools.partial(whole_number, "thesis")
-    iterations = whole("iterations", iterations)
-    sample = whole("sample", sample)
-    copies = whole("copies", copies, 0)
-    epochs = whole("epochs", epochs)
-    encoder_epochs = whole("encoder_epochs", encoder_epochs)
-    batch = None if batch is None else whole("batch", batch)
     real = functools.partial(number, "thesis")
-    threshold = real("threshold", threshold, lambda v: 0 <= v <= 1, "in 0 ... 1")
-    rate = real("rate", rate, lambda v: 0 < v < np.inf, "above 0")
-    encoder_rate = real("encoder_rate", encoder_rate, lambda v: 0 < v < np.inf, "above 0")
+    positive = (lambda v: 0 < v < np.inf), "above 0"
+    widths = None if hidden is None else np.atleast_1d(hidden).tolist()
+    if widths == []:
+        raise ValueError("thesis: hidden must be at least one width, received none")
     if not isinstance(replacement, bool):
         raise ValueError(f"thesis: replacement must be True or False, received {replacement!r}")
-    if hidden is not None:
-        hidden = tuple(whole("hidden", width) for width in np.atleast_1d(hidden).tolist())
-    if hidden == ():
-        raise ValueError("thesis: hidden must be at least one width, received none")
     settings = dict(
-        iterations=iterations,
-        sample=sample,
-        threshold=threshold,
-        copies=copies,
-        epochs=epochs,
-        rate=rate,
-        hidden=hidden and list(hidden),
-        encoder_epochs=encoder_epochs,
-        encoder_rate=encoder_rate,
-        batch=batch,
+        iterations=whole("iterations", iterations),
+        sample=whole("sample", sample),
+        threshold=real("threshold", threshold, lambda v: 0 <= v <= 1, "in 0 ... 1"),
+        copies=whole("copies", copies, 0),
+        epochs=whole("epochs", epochs),
+        rate=real("rate", rate, *positive),
+        hidden=widths and [whole("hidden", width) for width in widths],
+        encoder_epochs=whole("encoder_epochs", encoder_epochs),
+        encoder_rate=real("encoder_rate", encoder_rate, *positive),
+        batch=None if batch is None else whole("batch", batch),
     )
     if replacement:  # named only then, so that earlier states go on
         settings["replacement"] = True
@@ -105,9 +96,7 @@ def thesis(
         require_memory(data)
         first, then = jax.random.split(key)
         rows = scale_inputs(data)
-        widths, params, losses = train_encoder(
-            first, rows, hidden, encoder_epochs, encoder_rate, batch
-        )
+        widths, params, losses = train_encoder(first, rows, settings)
         codes = networks.codes_of(params, rows, widths)
         adversary = networks.adversary(codes.shape[1]).init(then)
         counts = dict.fromkeys(("iteration", "drawn", "failed"), np.zeros((), np.int64))
@@ -115,19 +104,19 @@ def thesis(
         return dict(codes=codes, losses=losses, **counts) | _flat(adversary)
 
     def step(key, data, memory, seen, ask):
-        if memory["iteration"] >= iterations:
+        if memory["iteration"] >= settings["iterations"]:
             return None
         _, for_training = jax.random.split(key)
-        lesson, rest = draw_halves(key, data.size, sample, replacement)
+        lesson, rest = draw_halves(key, data.size, settings["sample"], replacement)
 
         now = ask(lesson)
         once = np.unique(lesson)
         new = once[~seen.tried[once] & now.tried[once]]
         codes, before = memory["codes"], adversary_of(memory)
-        params = _train_adversary(for_training, before, codes, lesson, now, copies, epochs, rate)
+        params = _train_adversary(for_training, before, codes, lesson, now, settings)
         scores = np.asarray(jax.nn.sigmoid(networks.logits(params, codes)))
 
-        candidates = rest[scores[rest] >= threshold]
+        candidates = rest[scores[rest] >= settings["threshold"]]
         now = ask(candidates)
         counts = dict(
             iteration=memory["iteration"] + 1,
@@ -151,31 +140,30 @@ def draw_halves(key, size, sample, replacement):
     return drawn[:half], drawn[half:]
 
 
-def train_encoder(key, rows, hidden, epochs, rate, batch):
-    """The autoencoder trained on ``rows`` [n, d]: (its widths, params, losses [epochs]); None for
-    the default widths and batch.
+def train_encoder(key, rows, settings):
+    """The autoencoder trained on ``rows`` [n, d] by the ``settings`` of `thesis`: (its widths,
+    params, losses [epochs]).
     """
-    hidden = tuple(hidden) if hidden else networks.default_widths(rows.shape[1])
-    batch = batch or max(1, min(1000, len(rows) // 10))
-    return hidden, *networks.fit_autoencoder(
-        key, rows, hidden, epochs=epochs, batch=batch, rate=rate
-    )
+    hidden = tuple(settings["hidden"] or networks.default_widths(rows.shape[1]))
+    batch = settings["batch"] or max(1, min(1000, len(rows) // 10))
+    how = dict(epochs=settings["encoder_epochs"], rate=settings["encoder_rate"], batch=batch)
+    return hidden, *networks.fit_autoencoder(key, rows, hidden, **how)
 
 
-def _train_adversary(key, params, codes, lesson, seen, copies, epochs, rate):
+def _train_adversary(key, params, codes, lesson, seen, settings):
     """The adversary after training on those of ``lesson`` that were answered: a budget may end in
     the midst of it.
     """
     answered, failed = seen.tried[lesson], seen.failed[lesson]
-    rows = np.repeat(
-        np.arange(len(lesson), dtype=np.int32), np.where(failed, 1 + copies, 1) * answered
-    )
+    times = np.where(failed, 1 + settings["copies"], 1) * answered
+    rows = np.repeat(np.arange(len(lesson), dtype=np.int32), times)
     if len(rows) == 0:
         return params
     # of one size, whatever failed: one program for all iterations
-    room = np.zeros(len(lesson) * (1 + copies), np.int32)
+    room = np.zeros(len(lesson) * (1 + settings["copies"]), np.int32)
     room[: len(rows)] = rows
-    failed, how = failed.astype(np.float32), dict(epochs=epochs, rate=rate)
+    how = dict(epochs=settings["epochs"], rate=settings["rate"])
+    failed = failed.astype(np.float32)
     return networks.fit_adversary(key, params, codes[lesson], failed, room, len(rows), **how)[0]
 
 
