@@ -13,7 +13,7 @@ from jast._src.explain.held_out import DISTINCT
 from jast._src.explain.variants import EACH, draw_variants, find_seeds
 from jast._src.runtime.host_errors import runs_on_host
 
-__all__ = ["OTHERS", "Cases", "given_cases", "simulate_cases"]
+__all__ = ["given_cases", "simulate_cases"]
 
 OTHERS = "does not fail"  # what the others are called
 HOSTED_BUDGET = 3000  # evaluations of a black box by default
@@ -61,27 +61,27 @@ def simulate_cases(
                 f"{function}: budget must be at least {spent + 2 * DISTINCT * each}, {each}"
                 f" evaluations for each of {2 * DISTINCT} failures, received {budget}"
             )
-    v = draw_variants(key, sim, seeds, episodes)
-    if len(v.label) < 2 * DISTINCT:
+    e, kind, group, cost = draw_variants(key, sim, seeds, episodes)
+    failing = np.count_nonzero(kind)
+    if failing < 2 * DISTINCT:
         raise ValueError(
             f"{function}: failures must be such that small changes of them still fail, received"
-            f" ones of which {len(v.label)} of {episodes} changed episodes fail"
+            f" ones of which {failing} of {episodes} changed episodes fail"
         )
-    near = len(v.near_group) if most is None else min(most, len(v.near_group))
+    near = len(kind) - failing
+    near = near if most is None else min(most, near)
     if near < 2 * DISTINCT:
         raise ValueError(
             f"{function}: others: expected {2 * DISTINCT} or more changed failures that no longer"
             f" fail, received {near}: nearly everything fails"
         )
-    e = jax.tree.map(lambda a, b: np.concatenate([a, b[:near]]), v.failures, v.near)
-    kind = np.concatenate([1 + v.label, np.zeros(near, int)])
-    group = np.concatenate([v.group, v.near_group[:near]])
+    n = failing + near
     return Cases(
-        episodes=e,
-        kind=kind,
-        group=group,
+        episodes=jax.tree.map(lambda a: a[:n], e),
+        kind=kind[:n],
+        group=group[:n],
         names=(OTHERS, *seeds.names),
-        evaluations=seeds.evaluations + v.evaluations,
+        evaluations=seeds.evaluations + cost,
         asked=episodes,
     )
 

@@ -19,7 +19,7 @@ from jast._src.normal_space.evaluate_points import PointEvaluator
 from jast._src.normal_space.pcn import proposed
 from jast._src.search.refine.modes import Modes, owners
 
-__all__ = ["EACH", "Seeds", "Variants", "draw_variants", "find_seeds"]
+__all__ = ["EACH", "draw_variants", "find_seeds"]
 
 # how far the disturbances of a move go: 1 is a new draw; None: they all come some steps later
 SCALES = (1.0, 0.3, None, 1.0, 0.7, 1.0, None, 0.15, 1.0, 0.5)
@@ -41,19 +41,6 @@ class Seeds(NamedTuple):
     label: np.ndarray
     """[m] index into"""
     names: tuple[str, ...]
-    evaluations: int
-
-
-class Variants(NamedTuple):
-    """Episodes that fail, and near misses: [n] each."""
-
-    failures: Episode
-    label: np.ndarray
-    """[n] of the failures: index into the names of the seeds."""
-    group: np.ndarray
-    """[n] of the failures: those of one group come from the same seed, unless one seed has many."""
-    near: Episode
-    near_group: np.ndarray
     evaluations: int
 
 
@@ -154,8 +141,12 @@ def _mode_names(k: int) -> tuple:
     return tuple(f"mode {i + 1}" for i in range(k))
 
 
-def draw_variants(key: jax.Array, sim: Simulator, seeds: Seeds, n: int) -> Variants:
-    """``n`` failures and at most as many near misses, from Markov chains that begin at ``seeds``.
+def draw_variants(
+    key: jax.Array, sim: Simulator, seeds: Seeds, n: int
+) -> tuple[Episode, np.ndarray, np.ndarray, int]:
+    """``n`` failures and at most as many near misses, from Markov chains that begin at ``seeds``:
+    (episodes, the failures first; the kind of each, 0 of a near miss and else 1 + its label; its
+    group; evaluations). Those of one group come from the same seed, unless one seed has many.
 
     In each move of a chain some of the disturbances are drawn anew, or moved a little
     (`normal_space.pcn.proposed`), or all come some steps later, so that the model stays as it is:
@@ -189,24 +180,18 @@ def draw_variants(key: jax.Array, sim: Simulator, seeds: Seeds, n: int) -> Varia
     calm = transform.played(sim, near[missed]) if len(missed) else bad
     fails = np.flatnonzero(bad.failure)
     calm_rows = np.flatnonzero(~calm.failure) if len(missed) else np.zeros(0, int)
-    label, group = seeds.label[seed[fails]], seed[fails]
-    near_group = seed[missed[calm_rows]]
+    label, origin = seeds.label[seed[fails]], seed[fails]
+    group = np.concatenate([origin, seed[missed[calm_rows]]])
     crowded = any(
-        np.unique(group[label == k], return_counts=True)[1].max() > CROWDED * np.sum(label == k)
+        np.unique(origin[label == k], return_counts=True)[1].max() > CROWDED * np.sum(label == k)
         for k in np.unique(label)
     )
     if crowded:
         # no seed can be held out: its variants are
-        group = np.arange(len(fails))
-        near_group = len(fails) + np.arange(len(calm_rows))
-    return Variants(
-        failures=jax.tree.map(lambda a: a[fails], bad),
-        label=label,
-        group=group,
-        near=jax.tree.map(lambda a: a[calm_rows], calm),
-        near_group=near_group,
-        evaluations=evaluate.spent + len(z) + len(missed),
-    )
+        group = np.arange(len(group))
+    e = jax.tree.map(lambda a, b: np.concatenate([a[fails], b[calm_rows]]), bad, calm)
+    kind = np.concatenate([1 + label, np.zeros(len(calm_rows), int)])
+    return e, kind, group, evaluate.spent + len(z) + len(missed)
 
 
 def _redraw(rng: np.random.Generator, z: np.ndarray, scale: float) -> np.ndarray:
