@@ -170,9 +170,8 @@ def pictures(
                 )
         return found[t]
 
-    count = min(
-        len(steps), max(1, most // max(1, _length(drawn(steps[0])), _length(drawn(steps[-1]))))
-    )
+    longest = max(1, _length(drawn(steps[0])), _length(drawn(steps[-1])))
+    count = min(len(steps), max(1, most // longest))
     while True:
         places = np.unique(np.linspace(len(steps) - 1, 0, count).round().astype(int))
         fragments = [drawn(steps[i]) for i in places]

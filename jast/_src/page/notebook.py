@@ -4,14 +4,7 @@ from base64 import b64encode
 from typing import Any
 
 from jast._src.page.document import text
-from jast._src.stress_testing.report_words import (
-    advice,
-    belief,
-    fact_rows,
-    headline,
-    mode_facts,
-    shown_failures,
-)
+from jast._src.stress_testing import report_words
 from jast._src.util.display import html_table
 
 __all__ = ["cell"]
@@ -23,19 +16,20 @@ def cell(report: Any) -> str:
     """HTML without styles or scripts of its own: what was found, the probability with its interval
     and whether to believe it, and the first four modes, each with a picture where matplotlib is.
     """
-    told = belief(report.probability)
+    told = report_words.belief(report.probability)
     reasons = "".join(f"<li>{text(reason)}</li>" for reason in told.reasons)
+    facts = dict(report_words.fact_rows(report))
     parts = [
-        f"<h3>{text(headline(report)[0])}</h3>",
+        f"<h3>{text(report_words.headline(report)[0])}</h3>",
         f"<p>Probability of failure: <b>{text(told.value)}</b> {text(told.more)}<br>",
-        f"{text(told.badge)}</p><ul>{reasons}</ul>{html_table('', dict(fact_rows(report)))}",
+        f"{text(told.badge)}</p><ul>{reasons}</ul>{html_table('', facts)}",
     ]
-    for i, (failure, picture) in enumerate(zip(shown_failures(report, MODES), _pictures(report))):
-        words = " &middot; ".join(
-            text(f"{name} {value}") for name, value in mode_facts(report, i, failure)
-        )
+    shown = report_words.shown_failures(report, MODES)
+    for i, (failure, picture) in enumerate(zip(shown, _pictures(report))):
+        facts = report_words.mode_facts(report, i, failure)
+        words = " &middot; ".join(text(f"{name} {value}") for name, value in facts)
         parts.append(f"<p><b>Mode {i + 1}</b> {words}</p>{picture}")
-    return "".join([*parts, f"<p>{text(advice(report))}</p>"])
+    return "".join([*parts, f"<p>{text(report_words.advice(report))}</p>"])
 
 
 def _pictures(report: Any) -> list[str]:

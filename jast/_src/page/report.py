@@ -12,15 +12,7 @@ from jast._src.core.episode import Episode
 from jast._src.core.simulator import Simulator
 from jast._src.page.document import document, plain, rows, table, text, write
 from jast._src.page.episode_data import exact, groups, pictures, short, states_of, trace
-from jast._src.stress_testing.report_words import (
-    advice,
-    belief,
-    fact_rows,
-    headline,
-    mode_facts,
-    shown_failures,
-    work_rows,
-)
+from jast._src.stress_testing import report_words
 
 __all__ = ["write_report"]
 
@@ -71,7 +63,7 @@ def write_report(
             "Report.html: draw needs the simulator, which a report from a file does not hold:"
             " expected html(path, sim, draw=draw)"
         )
-    failures = shown_failures(report, MODES)
+    failures = report_words.shown_failures(report, MODES)
     if len(explanations) > len(failures):
         raise ValueError(
             f"Report.html: explanations must be at most {len(failures)}, one for each mode shown,"
@@ -146,13 +138,13 @@ def _title(report: Any) -> str:
 
 def _head(report: Any, modes: list[dict]) -> str:
     """The verdict on one screen."""
-    words, mood = headline(report)
+    words, mood = report_words.headline(report)
     return (
         f'<header><p class="kind">jast: adaptive stress test</p><h1 class="{mood}">{text(words)}'
         f"</h1>{_how(modes[0]) if modes else ''}</header>\n<main>\n<section id=verdict>"
         f"{_probability(report.probability)}"
-        f"{rows(fact_rows(report))}"
-        f"<p class=advice>{text(advice(report))}</p></section>"
+        f"{rows(report_words.fact_rows(report))}"
+        f"<p class=advice>{text(report_words.advice(report))}</p></section>"
     )
 
 
@@ -175,7 +167,7 @@ def _how(mode: dict) -> str:
 
 def _probability(p: Any) -> str:
     """The probability, its interval, and whether to believe it."""
-    b = belief(p)
+    b = report_words.belief(p)
     if p is None:
         return f"<div id=probability><h2>Probability of failure</h2><p>{b.value}</p></div>"
     reasons = "".join(f"<li>{text(words)}</li>" for words in b.reasons)
@@ -198,7 +190,8 @@ def _modes(
         return "<section id=modes><h2>Failure modes</h2><p>none</p></section>"
     cards = []
     for i, episode in enumerate(failures):
-        cards.append(_card(i + 1, mode_facts(report, i, episode), data[i], explanations[i]))
+        facts = report_words.mode_facts(report, i, episode)
+        cards.append(_card(i + 1, facts, data[i], explanations[i]))
     more = len(report.modes) - len(failures)
     notes = [f"{more} more modes are not shown."] * (more > 0)
     if sim is None:
@@ -230,7 +223,8 @@ def _card(number: int, facts: list, data: dict, explanations: list) -> str:
 
 
 def _work(report: Any) -> str:
-    lines = [(*row, "" if best == -np.inf else best) for *row, best in work_rows(report)]
+    tried = report_words.work_rows(report)
+    lines = [(*row, "" if best == -np.inf else best) for *row, best in tried]
     head = ("tried", "calls", "evaluations", "failing", "best log p relative to the mode")
     return f"<section id=tried><h2>What was tried</h2>{table(head, lines)}</section>"
 

@@ -10,15 +10,8 @@ import numpy as np
 
 from jast._src.core.episode import Episode, replay
 from jast._src.core.simulator import Simulator
-from jast._src.plot import style
-from jast._src.plot.series import (
-    DISTANCE,
-    Samples,
-    by_mode,
-    choose_fields,
-    samples_of,
-    series_of,
-)
+from jast._src.plot import series, style
+from jast._src.plot.series import DISTANCE, Samples
 from jast._src.plot.style import Axes
 
 __all__ = ["failure_fan"]
@@ -65,11 +58,11 @@ def failure_fan(
         >>> ax = jast.plot.failure_fan(found, sim)
     """
     caller = "failure_fan"
-    g = samples_of(caller, samples, sim, modes, most)
+    g = series.samples_of(caller, samples, sim, modes, most)
     rows = _rows(caller, g.sim, g.episodes, value)
     behind = []
     if nominal is not None:
-        some = samples_of(caller, nominal, g.sim, None, most).episodes
+        some = series.samples_of(caller, nominal, g.sim, None, most).episodes
         behind = _rows(caller, g.sim, some, value)
     with style.axes(ax, (6.8, 3.8)) as ax:
         for i, line in enumerate(behind):
@@ -92,7 +85,7 @@ def failure_fan(
 def _groups(g: Samples, ends: np.ndarray) -> list[tuple[np.ndarray, str, str, str]]:
     """(which episodes, colour, mark, words) of each kind of failure."""
     if g.mode is not None:
-        return by_mode(g)
+        return series.by_mode(g)
     n = len(ends)
     if not ((ends > 0).any() and (ends < 0).any()):
         return [(np.arange(n), style.BLUE, "o", f"{n} failures")]
@@ -106,8 +99,8 @@ def _groups(g: Samples, ends: np.ndarray) -> list[tuple[np.ndarray, str, str, st
 def _rows(caller: str, sim: Simulator, episodes: Episode, value: Any) -> list[np.ndarray]:
     """[steps + 1] of the value for each episode."""
     if isinstance(value, str):
-        played = series_of(sim, episodes)
-        names = choose_fields(caller, value, played, 1)
+        played = series.series_of(sim, episodes)
+        names = series.choose_fields(caller, value, played, 1)
         if len(names) > 1:
             raise ValueError(
                 f"plot.{caller}: value must name one number of {names}, received {value!r}, which"

@@ -13,31 +13,13 @@ from jast._src.core.episode import Episode
 from jast._src.core.signature import signature_of
 from jast._src.core.simulator import Simulator
 from jast._src.io.codec import name_of
-from jast._src.plot import style
+from jast._src.plot import series, style
 from jast._src.plot.episodes import disturbance_fields, shade_deviations
-from jast._src.plot.series import (
-    DISTANCE,
-    Samples,
-    Series,
-    choose_fields,
-    nominal_series,
-    replays_without_calls,
-    samples_of,
-    series_of,
-    undisturbed_series,
-)
+from jast._src.plot.series import DISTANCE, Series
 from jast._src.plot.style import Figure
 from jast._src.plot.traces import draw_traces
 from jast._src.runtime.host_errors import runs_on_host
-from jast._src.stress_testing.report_words import (
-    advice,
-    belief,
-    fact_rows,
-    headline,
-    mode_facts,
-    shown_failures,
-    work_rows,
-)
+from jast._src.stress_testing import report_words
 
 if TYPE_CHECKING:
     from jast.stress_testing import Report
@@ -97,12 +79,13 @@ def report(
             f"plot.report: report must be of jast.stress, received a {type(report).__name__}"
         )
     sim = report.sim if sim is None else sim
-    shown = shown_failures(report, MODES)
-    told = belief(report.probability)
+    shown = report_words.shown_failures(report, MODES)
+    told = report_words.belief(report.probability)
     left = _probability_rows(told)
-    right = _wrapped(fact_rows(report), 43)
-    title = textwrap.wrap(headline(report)[0], 72)
-    tried = work_rows(report)
+    right = _wrapped(report_words.fact_rows(report), 43)
+    verdict, mood = report_words.headline(report)
+    title = textwrap.wrap(verdict, 72)
+    tried = report_words.work_rows(report)
     top = 0.35 + 0.27 * len(title) + 0.15
     facts = max(0.7 + LINE * len(left), LINE * len(right)) + 0.25
     table = LINE * (len(tried) + 2) + 0.3
@@ -111,7 +94,7 @@ def report(
     with style.styled():
         figure = plt.figure(figsize=(WIDTH, height))
         page = _Page(figure, height)
-        _draw_title(page, title, headline(report)[1])
+        _draw_title(page, title, mood)
         page.y = MARGIN + top
         _draw_probability(page, told, left)
         _draw_rows(page, right, MARGIN + 3.75, 1.0)
@@ -121,7 +104,7 @@ def report(
         page.y = MARGIN + top + facts + modes
         _draw_work(page, report, tried)
         page.y += 0.1
-        for line in textwrap.wrap(advice(report), 100):
+        for line in textwrap.wrap(report_words.advice(report), 100):
             page.words(MARGIN, line, color=style.GREY, fontsize=8.5)
             page.y += LINE
     return figure
@@ -132,7 +115,7 @@ def pictures(report: Report) -> list[bytes]:
     which would be called again, they have disturbances alone.
     """
     sim = None if report.sim is None or runs_on_host(report.sim) else report.sim
-    shown, files = shown_failures(report, MODES), []
+    shown, files = report_words.shown_failures(report, MODES), []
     frugal = style.frugal_figure(COLOURS)
     with style.styled():
         owned = _series_of_modes(report, sim, shown, None) if shown else None
@@ -217,10 +200,11 @@ def _draw_modes(page: _Page, report: Any, sim: Any, shown: list, nominal: Any, u
     page.y += 0.45
     owned = _series_of_modes(report, sim, shown, nominal)
     for k, failure in enumerate(shown):
-        facts = "   ".join(f"{name} {value}" for name, value in mode_facts(report, k, failure))
+        facts = report_words.mode_facts(report, k, failure)
+        words = "   ".join(f"{name} {value}" for name, value in facts)
         colour = style.look(k)[0]
         page.words(MARGIN, f"Mode {k + 1}", -0.12, weight="bold", fontsize=9, color=colour)
-        page.words(MARGIN + 0.65, facts, -0.12, fontsize=7.5)
+        page.words(MARGIN + 0.65, words, -0.12, fontsize=7.5)
         _draw_mode(page, sim, owned, failure, k, units, legend=k == 0)
         page.y += MODE
 
@@ -229,9 +213,9 @@ def _series_of_modes(report: Any, sim: Any, shown: list, nominal: Any) -> tuple 
     """What the traces of all modes need; None without a simulator."""
     if sim is None:
         return None
-    g = _failures(report, sim, shown)
-    own, behind = series_of(sim, g.episodes), nominal_series("report", sim, nominal)
-    return g, own, behind, undisturbed_series(sim)
+    episodes, mode = _failures(report, sim, shown)
+    own, behind = series.series_of(sim, episodes), series.nominal_series("report", sim, nominal)
+    return mode, own, behind, series.undisturbed_series(sim)
 
 
 def _draw_mode(
@@ -244,24 +228,22 @@ def _draw_mode(
     _draw_disturbances(page.axes(x, wide, PANEL, 0.2), sim, failure)
 
 
-def _failures(report: Any, sim: Any, shown: list) -> Samples:
+def _failures(report: Any, sim: Any, shown: list) -> tuple[Episode, np.ndarray]:
     """The likeliest failure of each mode ``shown``, then those that the report has, unless each is
-    a call of a black box.
+    a call of a black box; and the mode of each.
     """
-    more = report.failures[: 64 if replays_without_calls(sim) else 0]
+    more = report.failures[: 64 if series.replays_without_calls(sim) else 0]
     each = [e._replace(states=None) for e in (*shown, *more)]
-    mode = np.arange(len(shown))
+    others = np.zeros(len(more), int)
     if report.modes and len(more):
-        others = samples_of("report", more, sim, report.modes, 64).mode
-    else:
-        others = np.zeros(len(each) - len(shown), int)
+        others = series.samples_of("report", more, sim, report.modes, 64).mode
     episodes = jax.tree.map(lambda *a: np.stack([np.asarray(b) for b in a]), *each)
-    return Samples(episodes, sim, np.concatenate([mode, others]), len(shown))
+    return episodes, np.concatenate([np.arange(len(shown)), others])
 
 
 def _draw_traces(
     page: _Page,
-    g: Samples,
+    mode: np.ndarray,
     own: Series,
     behind: Series | None,
     quiet: Series | None,
@@ -270,13 +252,12 @@ def _draw_traces(
     legend: bool,
 ) -> None:
     """Two panels of mode ``k``."""
-    rows = np.flatnonzero(g.mode == k)[: FAILURES + 1]
-    episodes = jax.tree.map(lambda a: a[rows], g.episodes)
-    few = Samples(episodes, g.sim, np.full(len(rows), k), k + 1)
+    rows = np.flatnonzero(mode == k)[: FAILURES + 1]
     part = Series({n: a[rows] for n, a in own.columns.items()}, own.length[rows], own.state)
     names = _most_unusual(part, behind)
     axes = [page.axes(MARGIN + 0.45 + 2.55 * i, 1.88, PANEL, 0.2) for i in range(len(names))]
-    draw_traces(axes, names, few, part, behind, quiet, units)
+    kinds = [(np.arange(len(rows)), *style.look(k), f"mode {k + 1}")]
+    draw_traces(axes, names, kinds, part, behind, quiet, units)
     for ax in axes:
         _shrink_labels(ax, "step")
     if legend:
@@ -291,7 +272,7 @@ def _draw_traces(
 
 def _most_unusual(own: Series, behind: Series | None) -> list[str]:
     """Two numbers, those of the first failure that leave the nominal bands the most."""
-    names = choose_fields("report", None, own, 1000)
+    names = series.choose_fields("report", None, own, 1000)
     far = {}
     for name in names:
         values = own.columns[name][0]

@@ -48,8 +48,6 @@ class Samples(NamedTuple):
     sim: Simulator
     mode: np.ndarray | None
     """[n] int: which failure mode each is of, from 0; None where there are no modes"""
-    modes: int
-    """How many modes there are"""
 
 
 class Series(NamedTuple):
@@ -107,18 +105,16 @@ def samples_of(caller: str, samples: Any, sim: Any, modes: Any, most: int) -> Sa
     rows = np.unique(np.linspace(0, n - 1, min(most, n)).round().astype(int))
     few = jax.tree.map(lambda a: a[rows], samples)
     if modes is None or (isinstance(modes, Modes) and not len(modes)):
-        return Samples(few, sim, None, 0)
+        return Samples(few, sim, None)
     if isinstance(modes, Modes):
-        return Samples(
-            few, sim, owners(sim, few._replace(states=None), _likeliest(modes)), len(modes)
-        )
+        return Samples(few, sim, owners(sim, few._replace(states=None), _likeliest(modes)))
     numbers = np.asarray(modes)
     if numbers.shape != (n,) or numbers.dtype.kind not in "iu" or numbers.min() < 0:
         raise ValueError(
             f"plot.{caller}: modes must be jast.search.Modes, or the number of its mode from 0 for"
             f" each of {n} episodes, received {modes!r}"
         )
-    return Samples(few, sim, numbers[rows], int(numbers.max()) + 1)
+    return Samples(few, sim, numbers[rows])
 
 
 def _likeliest(modes: Modes) -> Episode:
@@ -133,11 +129,9 @@ def by_mode(g: Samples) -> list[tuple[np.ndarray, str, str, str]]:
     if g.mode is None:
         n = len(g.episodes.length)
         return [(np.arange(n), *style.look(1), style.count_of(n, noun))]
-    each = [(k, np.flatnonzero(g.mode == k)) for k in range(g.modes)]
+    each = [(k, np.flatnonzero(g.mode == k)) for k in np.unique(g.mode)]
     return [
-        (own, *style.look(k), f"mode {k + 1}: {style.count_of(len(own), noun)}")
-        for k, own in each
-        if len(own)
+        (own, *style.look(k), f"mode {k + 1}: {style.count_of(len(own), noun)}") for k, own in each
     ]
 
 
@@ -172,14 +166,8 @@ def replays_without_calls(sim: Simulator) -> bool:
     return not runs_on_host(sim) or isinstance(signature_of(sim).state, Record)
 
 
-def _states(sim: Simulator, episodes: Episode) -> Any:
-    return jax.vmap(lambda e: replay(sim, e).states)(episodes)
-
-
-def _drawn(sim: Simulator, keys: jax.Array) -> Episode:
-    return jax.vmap(lambda k: rollout(k, sim))(keys)
-
-
+_states = jax.vmap(lambda sim, episode: replay(sim, episode).states, (None, 0))
+_drawn = jax.vmap(rollout, (0, None))
 _compiled_states, _compiled_draws = jax.jit(_states), jax.jit(_drawn)
 
 
@@ -223,7 +211,7 @@ def nominal_series(caller: str, sim: Simulator, nominal: Any) -> Series | None:
     if not count:
         return None
     keys = jax.random.split(jax.random.key(0), count)
-    return series_of(sim, (_drawn if runs_on_host(sim) else _compiled_draws)(sim, keys))
+    return series_of(sim, (_drawn if runs_on_host(sim) else _compiled_draws)(keys, sim))
 
 
 def undisturbed_series(sim: Simulator) -> Series | None:

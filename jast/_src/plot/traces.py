@@ -11,18 +11,8 @@ import numpy as np
 
 from jast._src.core.episode import Episode
 from jast._src.core.simulator import Simulator
-from jast._src.plot import style
-from jast._src.plot.series import (
-    DISTANCE,
-    Samples,
-    Series,
-    by_mode,
-    choose_fields,
-    nominal_series,
-    samples_of,
-    series_of,
-    undisturbed_series,
-)
+from jast._src.plot import series, style
+from jast._src.plot.series import DISTANCE, Series
 from jast._src.plot.style import Axes
 
 __all__ = ["draw_traces", "phase", "traces"]
@@ -73,16 +63,16 @@ def traces(
         True
     """
     caller = "traces"
-    g = samples_of(caller, samples, sim, modes, most)
-    own = series_of(g.sim, g.episodes)
-    behind, quiet = nominal_series(caller, g.sim, nominal), undisturbed_series(g.sim)
-    names = choose_fields(caller, fields, own, PANELS, quiet)
+    g = series.samples_of(caller, samples, sim, modes, most)
+    own = series.series_of(g.sim, g.episodes)
+    behind, quiet = series.nominal_series(caller, g.sim, nominal), series.undisturbed_series(g.sim)
+    names = series.choose_fields(caller, fields, own, PANELS, quiet)
     columns = 1 if len(names) < 4 else 2
     rows = -(-len(names) // columns)
     size = (6.8, 1.1 + 1.9 * rows) if columns == 1 else (9.6, 1.0 + 1.75 * rows)
     new = axes is None
     with style.panels(caller, axes, size, len(names), "field", columns) as axes:
-        draw_traces(axes, names, g, own, behind, quiet, units)
+        draw_traces(axes, names, series.by_mode(g), own, behind, quiet, units)
         for ax in axes[-columns:]:
             ax.set_xlabel("step")
             ax.tick_params(labelbottom=True)
@@ -97,23 +87,24 @@ def traces(
 def draw_traces(
     axes: list,
     names: list[str],
-    g: Samples,
+    kinds: list[tuple],
     own: Series,
     behind: Series | None,
     quiet: Series | None,
     units: dict | None = None,
 ) -> None:
-    """The panels of `traces`: the ``names`` on ``axes``, without labels of steps and a legend."""
+    """The panels of `traces`: the ``names`` on ``axes``, without labels of steps and a legend;
+    ``kinds``: as of `by_mode`, rows of ``own``.
+    """
     last = int(own.length.max())
     for ax, name in zip(axes, names, strict=True):
         if behind is not None and name in behind.columns:
             _bands(ax, behind.columns[name][:, : last + 1], len(behind.length))
         if quiet is not None and name in quiet.columns:
             row = quiet.columns[name][0, : last + 1]
-            ax.plot(
-                row, color=style.INK, linewidth=1.3, linestyle=style.DASHED, label="undisturbed"
-            )
-        for rows, colour, marker, label in by_mode(g):
+            look = dict(color=style.INK, linewidth=1.3, linestyle=style.DASHED)
+            ax.plot(row, label="undisturbed", **look)
+        for rows, colour, marker, label in kinds:
             alpha = float(np.clip(14 / len(rows), 0.15, 1.0))
             mark = dict(color=colour, marker=marker, markersize=4.5)
             for i in rows:
@@ -169,10 +160,10 @@ def phase(
         >>> ax = jast.plot.phase(found, sim, nominal=20)
     """
     caller = "phase"
-    g = samples_of(caller, samples, sim, modes, most)
-    own = series_of(g.sim, g.episodes)
-    behind, quiet = nominal_series(caller, g.sim, nominal), undisturbed_series(g.sim)
-    names = choose_fields(caller, fields, own, PANELS, quiet)
+    g = series.samples_of(caller, samples, sim, modes, most)
+    own = series.series_of(g.sim, g.episodes)
+    behind, quiet = series.nominal_series(caller, g.sim, nominal), series.undisturbed_series(g.sim)
+    names = series.choose_fields(caller, fields, own, PANELS, quiet)
     if fields is None:
         names = [k for k in names if k != DISTANCE] + [DISTANCE] * (DISTANCE in names)
         names = names[:2]
@@ -190,7 +181,7 @@ def phase(
             row = [quiet.columns[k][0] for k in names]
             look = dict(color=style.INK, linewidth=1.3, linestyle=style.DASHED)
             ax.plot(*row, **look, label="undisturbed", zorder=3)
-        for rows, colour, marker, label in by_mode(g):
+        for rows, colour, marker, label in series.by_mode(g):
             alpha = float(np.clip(14 / len(rows), 0.15, 1.0))
             mark = dict(color=colour, marker=marker, markersize=6)
             for i in rows:
