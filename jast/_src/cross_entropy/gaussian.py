@@ -93,7 +93,6 @@ def as_gaussian(proposal: Any) -> Gaussian:
 
 def _normal(name, mean, covariance):
     dtype = widest_float(mean, covariance)
-    traced = is_traced(covariance)
     m, c = (
         jnp.asarray(value) if is_traced(value) else finite_array(name, part, value, dtype)
         for part, value in (("mean", mean), ("covariance", covariance))
@@ -108,7 +107,7 @@ def _normal(name, mean, covariance):
             f"{name}: covariance must be a number, {d} variances or a {d} x {d} matrix, received"
             f" shape {c.shape}"
         )
-    if not traced:
+    if not is_traced(covariance):
         check_covariance(name, c)
     m, c = jnp.asarray(m, dtype), jnp.asarray(c, dtype)
     return Gaussian(m, c if c.ndim == 2 else jnp.diag(jnp.broadcast_to(c, (d,))))
@@ -162,9 +161,8 @@ def check_covariance(name, c):
 def sample(key: jax.Array, g: Gaussian, n: int) -> jax.Array:
     """``n`` draws [n, d]: mean + L z, L the Cholesky factor of the covariance."""
     z = jax.random.normal(key, (n, *g.mean.shape), g.mean.dtype)
-    return g.mean[None] + jnp.matmul(
-        z, jnp.linalg.cholesky(g.covariance).T, precision=Precision.HIGHEST
-    )
+    factor = jnp.linalg.cholesky(g.covariance)
+    return g.mean[None] + jnp.matmul(z, factor.T, precision=Precision.HIGHEST)
 
 
 def log_prob(g: Gaussian, x: jax.Array) -> jax.Array:
@@ -230,6 +228,5 @@ def is_definite(covariance, mean, rows):
     inverse = solve_triangular(
         jnp.linalg.cholesky(correlation), jnp.eye(d, dtype=covariance.dtype), lower=True
     )
-    return (jnp.sum(inverse**2) * (4 * (d + math.sqrt(rows)) * eps) < 1) & jnp.all(
-        spread > 4 * eps * jnp.abs(mean)
-    )  # False for NaN
+    sound = jnp.sum(inverse**2) * (4 * (d + math.sqrt(rows)) * eps) < 1  # False for NaN
+    return sound & jnp.all(spread > 4 * eps * jnp.abs(mean))

@@ -104,6 +104,7 @@ def begin(plan: Plan, key: jax.Array, proposal: Gaussian | Mixture) -> State:
     """The `State` before the first iteration."""
     d, dtype = moments(proposal).mean.shape[0], jax.tree.leaves(proposal)[0].dtype
     n, steps = sum(plan.counts), len(plan.counts)
+    proposals = jax.tree.map(lambda a: jnp.broadcast_to(a[None], (steps + 1, *a.shape)), proposal)
     return State(
         key=tree_keys(key, 1)[0],
         k=jnp.int32(0),
@@ -112,9 +113,7 @@ def begin(plan: Plan, key: jax.Array, proposal: Gaussian | Mixture) -> State:
         first=proposal,
         proposal=proposal,
         pending=jnp.zeros((plan.evaluated, d), dtype),
-        proposals=jax.tree.map(
-            lambda a: jnp.broadcast_to(a[None], (steps + 1, *a.shape)), proposal
-        ),
+        proposals=proposals,
         model_x=jnp.full((steps, plan.judged, d), jnp.nan, dtype),
     )
 
@@ -125,9 +124,8 @@ def ask(plan: Plan, state: State) -> jax.Array:
     count.
     """
     x = draw(_key(state, 0), state.proposal, max(plan.counts))
-    known = (state.k > 0) & (
-        jnp.arange(plan.evaluated, dtype=jnp.int32) < _at(plan.counts, state.k) // 2
-    )
+    rows = jnp.arange(plan.evaluated, dtype=jnp.int32)
+    known = (state.k > 0) & (rows < _at(plan.counts, state.k) // 2)
     return x.at[: plan.evaluated].set(jnp.where(known[:, None], state.pending, x[: plan.evaluated]))
 
 
@@ -144,9 +142,8 @@ def tell(plan, settings, state, x, value):
         x=state.x.at[places].set(x, mode="drop"),
         value=state.value.at[places].set(value, mode="drop"),
     )
-    elites = _elites(
-        *((state.x, state.value) if plan.elitism else (x, value)), kept, max(plan.elites)
-    )
+    pool = (state.x, state.value) if plan.elitism else (x, value)
+    elites = _elites(*pool, kept, max(plan.elites))
     proposal, pending = state.proposal, state.pending
     if plan.method == "ce_method":
         proposal = refit_to_elites(proposal, elites)
@@ -205,10 +202,8 @@ def finish(plan: Plan, state: State) -> CEResult:
     finite = jnp.isfinite(state.value)
     value = jnp.where(finite, state.value, jnp.inf)
     order = jnp.arange(len(value), dtype=jnp.int32)
-    place = jnp.argmin(
-        jnp.where(order[None, :] <= jnp.asarray(last, jnp.int32)[:, None], value[None, :], jnp.inf),
-        axis=1,
-    )
+    so_far = order[None, :] <= jnp.asarray(last, jnp.int32)[:, None]
+    place = jnp.argmin(jnp.where(so_far, value[None, :], jnp.inf), axis=1)
     best = value[place]
     x = jnp.where(jnp.isfinite(best)[:, None], state.x[place], jnp.nan)
     evaluated = order < _at(np.cumsum((0, *plan.counts)), state.k)
@@ -265,9 +260,8 @@ def moments(proposal):
     w = proposal.weights / jnp.sum(proposal.weights)
     mean = w @ proposal.means
     z = proposal.means - mean[None]
-    return Gaussian(
-        mean, jnp.einsum("k,kde->de", w, proposal.covariances) + jnp.einsum("k,kd,ke->de", w, z, z)
-    )
+    within = jnp.einsum("k,kde->de", w, proposal.covariances)
+    return Gaussian(mean, within + jnp.einsum("k,kd,ke->de", w, z, z))
 
 
 def refit_to_elites(proposal, elites):
@@ -369,7 +363,5 @@ def _refit_mixture(plan, settings, proposal, elites, sub, spread, everything):
 def _spherical_frame(proposal):
     """The frame of one scale for all coordinates: the root of the mean variance."""
     d = proposal.mean.size
-    return surrogates.Frame(
-        proposal.mean,
-        jnp.sqrt(jnp.trace(proposal.covariance) / d) * jnp.eye(d, dtype=proposal.mean.dtype),
-    )
+    scale = jnp.sqrt(jnp.trace(proposal.covariance) / d)
+    return surrogates.Frame(proposal.mean, scale * jnp.eye(d, dtype=proposal.mean.dtype))

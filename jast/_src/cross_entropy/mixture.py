@@ -146,11 +146,8 @@ def _em_iteration(m, x, w, diagonal, regularisation, least, least_variance):
     covariances = covariances + jnp.maximum(least_variance - variances, 0)[:, :, None] * eye
     # below, the sums of underflowing numbers are no longer averages
     moved = (count > tiny / eps) & jnp.all(jnp.isfinite(means), axis=1)
-    spread = (
-        moved
-        & (count >= least)
-        & jax.vmap(lambda c, mean: gaussian.is_definite(c, mean, n))(covariances, means)
-    )
+    definite = jax.vmap(lambda c, mean: gaussian.is_definite(c, mean, n))(covariances, means)
+    spread = moved & (count >= least) & definite
     total = jnp.sum(count)
     # eq. 9.26; its log stays finite
     share = jnp.maximum(count / jnp.where(total > 0, total, 1), tiny)

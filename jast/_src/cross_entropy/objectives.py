@@ -117,9 +117,8 @@ def _log_sierra(means, variances, x):
     x = _vector("sierra", x, 2)
     means, variances = means.astype(x.dtype), variances.astype(x.dtype)
     r2 = jnp.sum((x[None] - means) ** 2, axis=1)
-    return math.log(means.shape[0]) - logsumexp(
-        -0.5 * r2 / variances - jnp.log(2 * math.pi * variances)
-    )
+    log_densities = -0.5 * r2 / variances - jnp.log(2 * math.pi * variances)
+    return math.log(means.shape[0]) - logsumexp(log_densities)
 
 
 def branin(x: Array) -> Array:

@@ -12,14 +12,9 @@ from jast._src.core.counter_prng import numpy_generator
 from jast._src.core.episode import Episode
 from jast._src.core.simulator import Simulator
 from jast._src.core.typing import PRNGKey
+from jast._src.normal_space import episode_point
 from jast._src.normal_space.design_point_descent import differentiable
-from jast._src.normal_space.episode_point import (
-    EpisodePoint,
-    failing_point,
-    like_disturbances,
-    number_names,
-    number_steps,
-)
+from jast._src.normal_space.episode_point import EpisodePoint
 from jast._src.runtime.host_errors import runs_on_host
 from jast._src.util import checks, display
 
@@ -125,7 +120,7 @@ def attribution(
     permutations = checks.whole_number(name, "permutations", permutations, 2)
     key = jax.random.key(0) if key is None else key
     checks.check_random_key(name, key)
-    g = failing_point(name, sim, episode)
+    g = episode_point.failing_point(name, sim, episode)
     quiet = g.evaluate(np.zeros((1, len(g.v)))).distance[0]
     if not np.isfinite(quiet):
         raise ValueError(
@@ -140,8 +135,8 @@ def attribution(
         values, cost = _integrated(g), 4 * POINTS
     else:
         values, cost = _gradient(g), 4
-    x0, shaped = like_disturbances(g.sim, values)
-    steps, called = number_steps(g.sim), number_names(g.sim)
+    x0, shaped = episode_point.like_disturbances(g.sim, values)
+    steps, called = episode_point.number_steps(g.sim), episode_point.number_names(g.sim)
     live = np.flatnonzero(g.v)
     parts = [(int(steps[i]), called[i], float(values[i]), float(error[i])) for i in live]
     parts.sort(key=lambda part: -abs(part[2]))
@@ -149,7 +144,7 @@ def attribution(
     return Attribution(
         values=shaped,
         start=x0,
-        error=like_disturbances(g.sim, error)[1],
+        error=episode_point.like_disturbances(g.sim, error)[1],
         total=total,
         method=method,
         parts=tuple(parts),

@@ -239,9 +239,8 @@ def _modes_of(sim: Simulator, z: np.ndarray, length: np.ndarray, ways: Any) -> n
     """The mode of each of the points ``z`` [m, D], by direction: [m]."""
     known = np.arange(z.shape[1]) < transform.used_numbers(sim, length)[:, None]
     heads = gather_episodes("eigenfailures", "failures", sim, ways)
-    return pointing(
-        sim, np.where(known, z, 0), length, transform.normal_of(sim, heads), heads.length
-    )
+    ends = transform.normal_of(sim, heads), heads.length
+    return pointing(sim, np.where(known, z, 0), length, *ends)
 
 
 def _outcome(e: Episode) -> str:

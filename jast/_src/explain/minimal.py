@@ -9,14 +9,8 @@ import numpy as np
 
 from jast._src.core.episode import Episode, replay
 from jast._src.core.simulator import Simulator
-from jast._src.normal_space import transform
-from jast._src.normal_space.episode_point import (
-    EpisodePoint,
-    failing_point,
-    like_disturbances,
-    number_names,
-    number_steps,
-)
+from jast._src.normal_space import episode_point, transform
+from jast._src.normal_space.episode_point import EpisodePoint
 from jast._src.runtime.host_errors import runs_on_host
 from jast._src.util import display
 from jast._src.util.checks import number, whole_number
@@ -127,15 +121,15 @@ def minimal(
     if hosted:
         budget -= LAST
     slack = number(name, "slack", slack, lambda v: 0 <= v < np.inf, "0 or more")
-    g = failing_point(name, sim, episode, most=budget)
+    g = episode_point.failing_point(name, sim, episode, most=budget)
     if (farther := g._replace(v=(1 + slack) * g.v)).evaluate(farther.v[None]).failure[0]:
         g = farther
     kept = _find_needed(g, orders, budget)
     v = _shrink(g, np.where(kept, g.v, 0.0), budget)
     e = transform.played(g.sim, v[None])
     e = jax.device_get(replay(sim, jax.tree.map(lambda a: a[0], e._replace(states=None))))
-    kept &= number_steps(sim) <= int(e.length)
-    x0, needed = like_disturbances(sim, kept)
+    kept &= episode_point.number_steps(sim) <= int(e.length)
+    x0, needed = episode_point.like_disturbances(sim, kept)
     return Minimal(
         needed=needed,
         needed_start=x0,
@@ -243,7 +237,7 @@ def _parts(sim: Simulator, e: Episode, v: np.ndarray, kept: np.ndarray) -> tuple
     each = [np.asarray(a).reshape(len(a), -1) for a in jax.tree.leaves(e.disturbances)]
     first = [np.asarray(a).reshape(-1) for a in jax.tree.leaves(e.x0)]
     values = np.concatenate([*first, np.concatenate(each, axis=1).reshape(-1)])
-    steps, called = number_steps(sim), number_names(sim)
+    steps, called = episode_point.number_steps(sim), episode_point.number_names(sim)
     return tuple(
         (int(steps[i]), called[i], float(values[i]), float(v[i])) for i in np.flatnonzero(kept)
     )

@@ -91,9 +91,8 @@ class Rules(NamedTuple):
         e = gather_episodes("predict", "episodes", self.sim, episodes)
         key = jax.random.key(1)
         seen = play_to_horizon(self.sim, e, key, self.describer.of != "disturbances")
-        x = feature_table(
-            self.sim, self.describer, seen, _ends(numpy_generator(key), e, self.ends)
-        )[1]
+        ends = _ends(numpy_generator(key), e, self.ends)
+        _, x = feature_table(self.sim, self.describer, seen, ends)
         return np.asarray(self.classes)[self.tree.predict(x)]
 
 

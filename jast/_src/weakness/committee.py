@@ -103,9 +103,9 @@ def failure_gradient(committee, x, labels):
     def odds(x, label):
         each = jax.nn.log_softmax(logits(committee, x))
         # sums over the members are their mean, but for a constant that both have
-        return jax.nn.logsumexp(
-            jnp.where(jnp.arange(each.shape[1], dtype=label.dtype) == label, -jnp.inf, each)
-        ) - jax.nn.logsumexp(each[:, label])
+        own = jnp.arange(each.shape[1], dtype=label.dtype) == label
+        others = jnp.where(own, -jnp.inf, each)
+        return jax.nn.logsumexp(others) - jax.nn.logsumexp(each[:, label])
 
     with jax.numpy_rank_promotion("allow"):
         return jax.vmap(jax.grad(odds))(x, labels)

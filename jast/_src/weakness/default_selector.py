@@ -8,15 +8,8 @@ import numpy as np
 
 from jast._src.core.counter_prng import numpy_generator
 from jast._src.util.checks import number, whole_number
-from jast._src.weakness import committee
+from jast._src.weakness import committee, features
 from jast._src.weakness.failure_odds import fit_logistic, residual_log_odds, sigmoid
-from jast._src.weakness.features import (
-    difficulty_of_neighbours,
-    make_views,
-    principal_components,
-    reduce_inputs,
-    require_memory,
-)
 from jast._src.weakness.selector_contract import Selector, Step
 
 __all__ = ["PASSES", "STRENGTH", "default"]
@@ -77,18 +70,17 @@ def default(
     settings = dict(first=first, growth=growth, exploration=exploration, repeats=repeats)
 
     def start(key, data):
-        require_memory(data)
+        features.require_memory(data)
         rng = numpy_generator(key)
-        reduced = reduce_inputs(rng, data)
-        seen_as = make_views(data, reduced)
+        reduced = features.reduce_inputs(rng, data)
+        seen_as = features.make_views(data, reduced)
         close = reduced[:, :CLOSE]
         if not reduced.shape[1]:
-            close = principal_components(rng, seen_as.centred, CLOSE)
+            close = features.principal_components(rng, seen_as.centred, CLOSE)
         learn = committee.folds(rng, data.size, min(5, data.size), repeats)
-        difficulty = sum(
-            _odds(rng, view, data.labels, learn, learn, data) for view in seen_as
-        ) / len(seen_as)
-        neighbours = difficulty_of_neighbours(rng, close, data.labels, data.classes)
+        opinions = [_odds(rng, view, data.labels, learn, learn, data) for view in seen_as]
+        difficulty = sum(opinions) / len(opinions)
+        neighbours = features.difficulty_of_neighbours(rng, close, data.labels, data.classes)
         drawn, blends = np.zeros(data.size, bool), np.tile(PRIOR, (data.size, 1))
         return dict(
             reduced=reduced,
@@ -104,20 +96,18 @@ def default(
     def step(key, data, memory, seen, ask):
         rng = numpy_generator(key)
         least = max(10, data.size // 200) if first is None else first
-        chosen, likely = _batch(
-            rng, memory["suspicion"], seen, max(least, round(growth * len(seen.order))), exploration
-        )
+        size = max(least, round(growth * len(seen.order)))
+        chosen, likely = _batch(rng, memory["suspicion"], seen, size, exploration)
         seen = ask(chosen)
         tried = seen.tried
         answers = np.where(tried, seen.predicted, data.labels)
         weights = memory["learn"] * np.where(tried, STRENGTH, 1)
         imitations = [
             _odds(rng, view, answers, weights, memory["learn"], data)
-            for view in make_views(data, memory["reduced"])
+            for view in features.make_views(data, memory["reduced"])
         ]
-        rows = np.stack(
-            [memory["difficulty"], *imitations, memory["neighbours"], np.ones(data.size)], axis=1
-        )
+        opinions = memory["difficulty"], *imitations, memory["neighbours"], np.ones(data.size)
+        rows = np.stack(opinions, axis=1)
         blend = fit_logistic(rows[tried], seen.failed[tried], PRIOR, PRECISION)
         # an input that was run is judged by the blend from before its outcome was known
         blends = np.where(tried[:, None], memory["blends"], blend)
@@ -148,9 +138,8 @@ def _expected(scores, seen, drawn):
 def _odds(rng, x, answers, weights, learn, data):
     """[n] log odds against each input's label, by the members that have not learned from it."""
     trained = committee.fit(rng, x, answers, weights, data.classes, PASSES[data.image])
-    right = np.clip(
-        committee.held_out_probability(trained, x, data.labels, learn).astype(float), 1e-6, 1 - 1e-6
-    )
+    right = committee.held_out_probability(trained, x, data.labels, learn)
+    right = np.clip(right.astype(float), 1e-6, 1 - 1e-6)
     return np.log1p(-right) - np.log(right)
 
 

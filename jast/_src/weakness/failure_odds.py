@@ -113,9 +113,8 @@ def _laplace(kernel, target, mean):
         w = np.maximum(p * (1 - p), 1e-10)
         root = np.sqrt(w)
         b = w * f + target - p
-        aim = b - root * np.linalg.solve(
-            np.eye(m) + root[:, None] * kernel * root, root * (kernel @ b)
-        )
+        scaled = np.eye(m) + root[:, None] * kernel * root
+        aim = b - root * np.linalg.solve(scaled, root * (kernel @ b))
         step = 1.0
         while True:
             new_a = a + step * (aim - a)

@@ -93,9 +93,8 @@ def centre(x, image):
     deviation = np.sqrt(np.mean(x**2, axis=None if image else 0))
     # a column that is the same for nearly all inputs must not stand above the others where it is
     # not
-    return np.clip(x / np.where(deviation > 0, deviation, 1), -8, 8).astype(
-        np.float32
-    ) * np.float32(SPREAD)
+    x = np.clip(x / np.where(deviation > 0, deviation, 1), -8, 8)
+    return x.astype(np.float32) * np.float32(SPREAD)
 
 
 def principal_components(rng, x, k):
@@ -128,9 +127,8 @@ def difficulty_of_neighbours(rng, close, labels, classes):
         d2[rows[:, None] == reference] = np.inf  # not itself
         near = np.argpartition(d2, k - 1, axis=1)[:, :k]
         weight = 1 / (np.take_along_axis(d2, near, 1) + 1e-3)
-        right[rows] = np.sum(
-            weight * (labels[reference[near]] == labels[rows][:, None]), axis=1
-        ) / np.sum(weight, axis=1)
+        same = labels[reference[near]] == labels[rows][:, None]
+        right[rows] = np.sum(weight * same, axis=1) / np.sum(weight, axis=1)
     right = (right * k + 1 / classes) / (k + 1)  # one more, that knows nothing
     return np.log1p(-right) - np.log(right)
 

@@ -150,9 +150,8 @@ def _fit(key, params, data, apply, *, epochs, rate, loss, batch):
         params, state, total = carry
         now = i * batch + jnp.arange(batch, dtype=jnp.int32)
         weight = (now < size).astype(jnp.float32)  # the last batch may be smaller
-        value, gradient = jax.value_and_grad(mean_loss)(
-            params, order[jnp.minimum(now, size - 1)], weight
-        )
+        at = order[jnp.minimum(now, size - 1)]
+        value, gradient = jax.value_and_grad(mean_loss)(params, at, weight)
         params, state = adam_step(params, state, gradient, rate)
         return params, state, total + value * jnp.sum(weight)
 
@@ -164,9 +163,8 @@ def _fit(key, params, data, apply, *, epochs, rate, loss, batch):
         )
         return (params, state), total / size.astype(jnp.float32)
 
-    (params, _), losses = lax.scan(
-        epoch, (params, adam().init(params)), jax.random.split(key, epochs)
-    )
+    start = params, adam().init(params)
+    (params, _), losses = lax.scan(epoch, start, jax.random.split(key, epochs))
     return params, losses
 
 

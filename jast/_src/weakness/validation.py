@@ -134,11 +134,8 @@ def _described(selector):
 
 def _begin(key, data, selector):
     n = data.size
-    history = History(
-        *(np.zeros(0, int) for _ in range(2)),
-        *(np.zeros(0) for _ in range(4)),
-        np.zeros((0, n), np.float32),
-    )
+    columns = (np.zeros(0, kind) for kind in (int, int, float, float, float, float))
+    history = History(*columns, scores=np.zeros((0, n), np.float32))
     numbers = np.asarray(jax.random.key_data(key))
     if numbers.shape != (2,):  # of another generator
         numbers = numpy_generator(key).integers(0, 2**32, 2, np.uint32)
@@ -218,18 +215,16 @@ def _run(state, selector, data, predict, budget, store, progress, callback):
             answered.extend(batch.tolist())
             watch.reach(len(answered))
             keep()
-        current = _seen(
-            current.order.tolist() + [i for i in new if answers[i] >= 0], answers, data.labels
-        )
+        order = current.order.tolist() + [i for i in new if answers[i] >= 0]
+        current = _seen(order, answers, data.labels)
         return current
 
     idle = 0
     try:
         while not finished and len(seen.order) < budget:
             current = seen
-            step = selector.step(
-                iteration_key(state.key, 1 + len(history.calls)), data, memory, seen, ask
-            )
+            key = iteration_key(state.key, 1 + len(history.calls))
+            step = selector.step(key, data, memory, seen, ask)
             if step is None:
                 finished = True
                 break
