@@ -120,9 +120,8 @@ def widest_float(*values):
     floats = [
         v.dtype for v in values if hasattr(v, "dtype") and jnp.issubdtype(v.dtype, jnp.floating)
     ]
-    return jax.dtypes.canonicalize_dtype(
-        max(floats, key=lambda t: t.itemsize, default=jnp.zeros(()).dtype)
-    )
+    widest = max(floats, key=lambda t: t.itemsize, default=jnp.zeros(()).dtype)
+    return jax.dtypes.canonicalize_dtype(widest)
 
 
 def finite_array(name, part, value, dtype):
@@ -225,8 +224,7 @@ def is_definite(covariance, mean, rows):
     d, eps = covariance.shape[-1], float(jnp.finfo(covariance.dtype).eps)
     spread = jnp.sqrt(jnp.diagonal(covariance))
     correlation = covariance / spread[:, None] / spread[None, :]
-    inverse = solve_triangular(
-        jnp.linalg.cholesky(correlation), jnp.eye(d, dtype=covariance.dtype), lower=True
-    )
+    factor = jnp.linalg.cholesky(correlation)
+    inverse = solve_triangular(factor, jnp.eye(d, dtype=covariance.dtype), lower=True)
     sound = jnp.sum(inverse**2) * (4 * (d + math.sqrt(rows)) * eps) < 1  # False for NaN
     return sound & jnp.all(spread > 4 * eps * jnp.abs(mean))

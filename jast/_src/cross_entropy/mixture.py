@@ -18,14 +18,7 @@ from jast._src.cross_entropy.gaussian import Gaussian
 from jast._src.runtime._jax import is_traced
 from jast._src.util import display
 
-__all__ = [
-    "Mixture",
-    "as_mixture",
-    "em",
-    "log_prob",
-    "responsibilities",
-    "sample",
-]
+__all__ = ["Mixture", "as_mixture", "em", "log_prob", "responsibilities", "sample"]
 
 
 @display.printable()

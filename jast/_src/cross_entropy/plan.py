@@ -92,9 +92,8 @@ def make_plan(
             raise ValueError(
                 f"{method}: {name} must be one of {list(allowed)}, received {chosen[name]!r}"
             )
-    for name, value in dict(
-        elitism=chosen["elitism"], current=chosen.get("current", False), ratchet=ratchet
-    ).items():
+    truths = dict(elitism=chosen["elitism"], current=chosen.get("current", False), ratchet=ratchet)
+    for name, value in truths.items():
         if not isinstance(value, bool):
             raise ValueError(f"{method}: {name} must be True or False, received {value!r}")
     positive = (lambda v: 0 < v < math.inf), "above 0"

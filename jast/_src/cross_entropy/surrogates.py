@@ -119,18 +119,15 @@ def fit_process(x, y, mask, lengthscales, noises=NOISES, kernel="squared exponen
 def _factored(r2, y, mask, lengthscale, noise, kernel):
     """Cholesky factor, weights, signal variance and log likelihood at one point of the grid."""
     both = mask[:, None] & mask[None, :]
-    k = jnp.where(both, KERNELS[kernel](r2 / lengthscale**2), 0) + jnp.diag(
-        jnp.where(mask, noise, 1)
-    )
-    factor = jnp.linalg.cholesky(k)
+    k = jnp.where(both, KERNELS[kernel](r2 / lengthscale**2), 0)
+    factor = jnp.linalg.cholesky(k + jnp.diag(jnp.where(mask, noise, 1)))
     weights = cho_solve((factor, True), y)
     n = jnp.sum(mask, dtype=y.dtype)
     # of greatest likelihood: d/dv of eq. 2.30 = 0
     variance = jnp.maximum(y @ weights / jnp.maximum(n, 1), jnp.finfo(y.dtype).tiny)
     # R&W eq. 2.30 with that variance, for which the data's term is n / 2
-    log_likelihood = -0.5 * n * (1 + jnp.log(variance) + math.log(2 * math.pi)) - jnp.sum(
-        jnp.log(jnp.diagonal(factor))
-    )
+    of_data = -0.5 * n * (1 + jnp.log(variance) + math.log(2 * math.pi))
+    log_likelihood = of_data - jnp.sum(jnp.log(jnp.diagonal(factor)))
     return factor, weights, variance, log_likelihood
 
 
@@ -288,10 +285,9 @@ def fit(kind, x, y, mask, frame, detail=None):
     normal = features.T @ features
     # a masked centre is no feature
     live = jnp.maximum(jnp.sum(jnp.diagonal(normal) > 0, dtype=x.dtype), 1)
-    ridge = jnp.maximum(RIDGE * jnp.trace(normal) / live, jnp.finfo(x.dtype).tiny) * jnp.eye(
-        len(normal), dtype=x.dtype
-    )
-    weights = cho_solve(cho_factor(normal + ridge), features.T @ jnp.where(mask, y, 0))
+    ridge = jnp.maximum(RIDGE * jnp.trace(normal) / live, jnp.finfo(x.dtype).tiny)
+    definite = normal + ridge * jnp.eye(len(normal), dtype=x.dtype)
+    weights = cho_solve(cho_factor(definite), features.T @ jnp.where(mask, y, 0))
     return Surrogate(frame, Basis(z, mask, weights, detail))
 
 

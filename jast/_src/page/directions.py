@@ -23,16 +23,14 @@ def directions(found: Eigenfailures) -> list[dict]:
     for k, way in enumerate(found.directions):
         order = np.argsort(-np.abs(way), kind="stable")
         moved = dict.fromkeys(found.names[i] for i in order if found.steps[i] > 0)
-        ends = [
-            _columns(jax.tree.map(lambda a, k=k: a[k], e), steps) for e in (found.minus, found.plus)
-        ]
+        both = (jax.tree.map(lambda a, k=k: a[k], e) for e in (found.minus, found.plus))
+        ends = [_columns(e, steps) for e in both]
         panels = [
             {"name": name, "columns": [end[name] for end in ends], "quiet": [middle[name]]}
             for name in list(moved)[:PANELS]
         ]
-        words = (
-            f"direction {k + 1} (variance {found.variances[k]:.3g}, shift {found.shifts[k]:.3g})"
-        )
+        about = f"variance {found.variances[k]:.3g}, shift {found.shifts[k]:.3g}"
+        words = f"direction {k + 1} ({about})"
         out.append({"name": words, "steps": steps.tolist(), "panels": panels})
     return out
 

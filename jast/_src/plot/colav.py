@@ -265,9 +265,8 @@ class _Panel:
     def show(self, t):
         """The panel ``t`` steps after the start, which need not be whole."""
         now = [_at(rows, t) for rows in self.log[:3]]
-        for line, rows, here in zip(
-            (self.ferry, self.adversary, self.believed), self.log[:3], now, strict=True
-        ):
+        lines = self.ferry, self.adversary, self.believed
+        for line, rows, here in zip(lines, self.log[:3], now, strict=True):
             line.set_data(*np.concatenate([rows[: math.ceil(t)], here[None]])[:, :2].T)
         self.error.set_data(*np.stack(now[1:])[:, :2].T)
         for patch, zone in zip(self.zones, ZONES, strict=True):
@@ -275,9 +274,8 @@ class _Panel:
             patch.set_xy(zone_outline(zone, north, east, course))
         for patch, here in zip(self.hulls, now, strict=True):
             patch.set_xy(_place(*HULL.T, *here))
-        self.title.set_text(
-            f"t = {t * PERIOD:.0f} s, ordered {self.log.order[math.floor(t)]:.2f} m/s"
-        )
+        order = self.log.order[math.floor(t)]
+        self.title.set_text(f"t = {t * PERIOD:.0f} s, ordered {order:.2f} m/s")
 
 
 def _states(caller, episode, sim):

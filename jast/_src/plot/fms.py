@@ -57,9 +57,8 @@ def fms(episode: Episode, sim: Simulator, axes: Sequence[Axes] | None = None) ->
     style.one_episode("fms", episode)
     path = fms_path(sim, episode)
     model = sim.init.args[0]
-    arcs, built, error, event, path = jax.device_get(
-        (*_arcs(model.build.earth, path, model.event), path)
-    )
+    drawn = *_arcs(model.build.earth, path, model.event), path
+    arcs, built, error, event, path = jax.device_get(drawn)
     path = jax.tree.map(lambda a: a[: _count(path, a)], path)
     n = len(path.waypoints) - 2
     size = (11.5, 6.3)

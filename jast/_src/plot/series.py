@@ -241,9 +241,8 @@ def choose_fields(
         return [*rest[: most - len(own)], *own]
     found = []
     for name in [names] if isinstance(names, str) else list(names):
-        these = [k for k in of.columns if k == name] or [
-            k for k in of.columns if k.startswith(f"{name}[") or k.startswith(f"{name}.")
-        ]
+        parts = [k for k in of.columns if k.startswith((f"{name}[", f"{name}."))]
+        these = [name] if name in of.columns else parts
         if not these:
             raise ValueError(
                 f"plot.{caller}: fields must be among {list(of.columns)}, received {name!r}"

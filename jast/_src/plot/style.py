@@ -155,11 +155,9 @@ def halo():
 
 def headline(what, episode, more=""):
     """What happened, and the numbers that identify the episode."""
-    outcome = (
-        f"{'failure at step' if episode.failure else 'no failure, steps:'} {int(episode.length)}"
-    )
+    outcome = "failure at step" if episode.failure else "no failure, steps:"
     return (
-        f"{what}: {outcome}\nreward {float(episode.reward):.3f},  log p"
+        f"{what}: {outcome} {int(episode.length)}\nreward {float(episode.reward):.3f},  log p"
         f" {float(episode.log_prob):.3f}{more}"
     )
 

@@ -160,9 +160,8 @@ def likely_failures(
     if kind not in KINDS:
         raise ValueError(f"plot.{caller}: kind must be one of {list(KINDS)}, received {kind!r}")
     suspect = networks.scores >= 0.5
-    there = {"true positives": failed & suspect, "false negatives": failed & ~suspect}.get(
-        kind, np.ones(n, bool)
-    )
+    of_kind = {"true positives": failed & suspect, "false negatives": failed & ~suspect}
+    there = of_kind.get(kind, np.ones(n, bool))
     order = np.argsort(networks.scores if kind == "false negatives" else -networks.scores)
     chosen = order[there[order]][: whole_number(f"plot.{caller}", "count", count)]
     if not len(chosen):

@@ -205,9 +205,8 @@ def _run(state, selector, data, predict, budget, store, progress, callback):
                 f"validate: the selector {selector.name} must ask for indices [m] in 0 ..."
                 f" {data.size - 1}, received {indices!r}"
             )
-        new = [i for i in dict.fromkeys(indices.tolist()) if current.predicted[i] < 0][
-            : budget - len(current.order)
-        ]
+        left = budget - len(current.order)
+        new = [i for i in dict.fromkeys(indices.tolist()) if current.predicted[i] < 0][:left]
         fresh = [i for i in new if answers[i] < 0][: budget - len(answered)]
         for at in range(0, len(fresh), CHUNK):
             batch = np.asarray(fresh[at : at + CHUNK])
