@@ -10,7 +10,8 @@ import scipy.stats
 from jax.tree_util import Partial
 
 import jast
-from benchmarks.few_calls import metaballs
+from benchmarks.few_calls import metaballs, signed
+from jast import distributions as D
 from jast._src.estimate.few_calls import active_learning, few_calls, surrogate, surrogate_pool
 from jast._src.util.intervals import clopper_pearson
 from jast.distributions import MultivariateNormalDiag
@@ -50,6 +51,65 @@ def test_the_surrogate_knows_a_linear_limit_state_from_its_safe_side():
     truth = (1.0 - new[:, 0]) / g[g > 0].std()
     assert np.abs(mean - truth).max() < 0.1 and sd.max() < 0.2
     assert (surrogate_pool.expected(s, new)[0] > 0.5).tolist() == (truth < 0).tolist()
+
+
+def test_the_surrogate_knows_how_deep_failures_are_where_they_say_it():
+    """The plane again, whose failures are values: it is known beyond the boundary as before it."""
+    z, _, _ = _data()
+    g = 1.0 - z[:, 0]
+    s = surrogate.fit(z, g, np.zeros(len(z), bool))
+    deep = np.random.default_rng(1).standard_normal((200, 3)) + [3, 0, 0]
+    mean, sd = surrogate.predict(s, deep)
+    assert np.abs(mean * g.std() - (1.0 - deep[:, 0])).max() < 0.05
+    clamped = surrogate.fit(z, np.maximum(g, 0), g <= 0)
+    assert sd.mean() * g.std() < surrogate.predict(clamped, deep)[1].mean() * g[g > 0].std()
+
+
+def test_a_warp_is_odd_about_the_boundary():
+    """Turned about, a plane through the origin stays the same plane."""
+    z, _, _ = _data()
+    none = np.zeros(len(z), bool)
+    here, there = (surrogate.fit(sign * z, -z[:, 0] * sign, none, warp=0.3) for sign in (1, -1))
+    np.testing.assert_allclose(here.evidence, there.evidence, rtol=1e-6)
+
+
+def test_what_every_failure_says_alike_is_no_depth():
+    depths = active_learning._depths(np.array([0.5, -1.0, -0.2, -1.0, 0.0, 0.0, 0.5]))
+    assert depths.tolist() == [False, False, True, False, False, False, False]
+
+
+@pytest.mark.slow
+def test_a_signed_distance_tells_more(coarse):
+    """60 calls of a curved boundary, three keys: the standard errors are smaller where the distance
+    goes on below 0.
+    """
+
+    def curved(x):
+        return 3.5 - x[0] + 0.1 * x[1] ** 2 - 0.05 * x[2] ** 3
+
+    errors = [
+        np.mean([failure_probability(jax.random.key(k), sim, 60).relative_error for k in range(3)])
+        for sim in (limit_state(curved, 3), signed(curved, 3))
+    ]
+    assert errors[1] < errors[0] / 1.5
+
+
+def test_depth_is_asked_of_what_is_judged_at_its_end_alone(key, coarse):
+    """An episode of several steps ends where it fails, so its depth is that of one step."""
+
+    def system(judge):
+        return jast.Simulator(
+            init=lambda x0: jnp.zeros(()),
+            step=lambda s, x: s + x,
+            disturbance=lambda s: D.Normal(0.0, 1.0),
+            evaluate=lambda s: (s >= 2.0, judge(2.0 - s)),
+            horizon=3,
+        )
+
+    deep, clamped = (
+        failure_probability(key, system(judge), 50) for judge in (lambda d: d, jax.nn.relu)
+    )
+    assert deep.mean == clamped.mean and deep.relative_error == clamped.relative_error
 
 
 def test_the_gradient_of_the_likelihood_is_that_of_its_differences():
@@ -177,8 +237,8 @@ def test_an_interruption_keeps_what_the_last_calls_have_shown(coarse):
         failure_probability(jax.random.key(0), sim, 50, callback=stop(12))
 
 
-@pytest.mark.parametrize("budget", [49, 0, 60.5])
-def test_fewer_than_fifty_calls_are_refused(budget):
+@pytest.mark.parametrize("budget", [39, 0, 60.5])
+def test_fewer_than_forty_calls_are_refused(budget):
     with pytest.raises(ValueError, match="budget"):
         failure_probability(
             jax.random.key(0), limit_state(Partial(_plane, jnp.asarray(3.0)), 2), budget

@@ -96,8 +96,9 @@ def failure_probability(
 
     Fewer than 5000 episodes are for systems that cost a second each. A Gaussian process learns the
     limit state from two thirds of them, 240 at most: the miss distance of the safe ones, and where
-    failures are. The others, drawn at random, correct it: the interval comes from these, and holds
-    the surrogate's error. Batches of calls suit black boxes with workers. The estimate is
+    failures are; of those whose distance is below 0, where an episode is judged at its end alone,
+    how deep they are. The others, drawn at random, correct it: the interval comes from these, and
+    holds the surrogate's error. Batches of calls suit black boxes with workers. The estimate is
     UNRELIABLE if one call changes much, the relative standard error is above 25 %, or there are
     fewer than 10 failures; if there are none, draws of the model give an upper bound. The method
     itself takes some 4 CPU seconds for 200 calls,
@@ -125,7 +126,7 @@ def failure_probability(
     Args:
         key: consumed.
         sim: the simulator; its disturbances have quantile functions.
-        budget: episodes to simulate, at least 50. Default: what the system simulates in some eight
+        budget: episodes to simulate, at least 40. Default: what the system simulates in some eight
             CPU seconds, from 300,000 to 33,554,432; 100,000 where 300,000 take more than 24. Where
             the standard error of an answer by populations or plain draws is above 5 %, or nothing
             confirms it, and 4,194,304 would do, it is made again with as many as it needs (but not
@@ -157,7 +158,7 @@ def failure_probability(
         counts each episode, and three for one with its gradient.
 
     Raises:
-        ValueError: for a budget below 50, a budget together with ``seconds``, ``seconds`` not above
+        ValueError: for a budget below 40, a budget together with ``seconds``, ``seconds`` not above
             0, a level outside (0, 1), disturbances without a quantile function, and where the
             simulator's functions do not fit together.
 

@@ -61,6 +61,8 @@ class Learner:
         self.dtype, self.dimension = transform.normal_numbers(sim), transform.dimension(sim)
         self.z, self.distance = np.zeros((0, self.dimension)), np.zeros(0)
         self.failing, self.invalid = np.zeros(0, bool), np.zeros(0, bool)
+        # a longer episode ends where it fails, however deep it would have got
+        self.shows_depth = sim.episodic or sim.horizon == 1
         self.steps, self.spent = 0, 0
         self.plain = (0, 0, 0)  # (failing, invalid, calls) of draws of the model
         self.surrogate: Surrogate | None = None
@@ -83,7 +85,9 @@ class Learner:
 
     def record(self, z, distance, failing, invalid):
         """Keep what was seen at ``z``."""
-        distance = np.where(failing, 0.0, np.asarray(distance, np.float64))
+        distance = np.asarray(distance, np.float64)
+        depth = self.shows_depth & np.isfinite(distance)
+        distance = np.where(failing & ~depth, 0.0, distance)
         self.z = np.concatenate([self.z, z.astype(np.float64)])
         self.distance = np.concatenate([self.distance, distance])
         self.failing = np.concatenate([self.failing, failing])
@@ -92,12 +96,13 @@ class Learner:
     def fit(self, with_warp: bool) -> None:
         """Fit the surrogate to what was seen; ``with_warp``: with the choice of its warp."""
         rows = np.flatnonzero(~self.invalid)[:HELD]
-        data = self.z[rows], self.distance[rows], self.failing[rows]
+        hidden = self.failing[rows] & ~_depths(self.distance[rows])
+        data = self.z[rows], self.distance[rows], hidden
         if not with_warp and self.surrogate is not None:
             self.surrogate = fit(*data, self.surrogate, self.surrogate.warp, rounds=1)
             return
-        safe = self.distance[rows][~self.failing[rows]]
-        middle = float(np.median(safe)) if len(safe) else 0.0
+        seen = np.abs(self.distance[rows][~hidden])
+        middle = float(np.median(seen)) if len(seen) else 0.0
         warps = [math.inf, *(middle * w for w in WARPS if middle > 0)]
         tried = [fit(*data, self.surrogate, warp) for warp in warps]
         self.surrogate = max(tried, key=lambda surrogate: surrogate.evidence)
@@ -130,6 +135,14 @@ def choose_calls(learner: Learner) -> None:
         f"learning: {learner.spent} calls, {int(learner.failing.sum())} failures,"
         f" {int(learner.invalid.sum())} invalid"
     )
+
+
+def _depths(distance):
+    """Which of these [n] say how deep an episode failed: below 0, and not what others say, too, as
+    a -1 that stands for every failure.
+    """
+    _, which, count = np.unique(distance, return_inverse=True, return_counts=True)
+    return (distance < 0) & (count[which] == 1)
 
 
 def _unseen(learner, n):

@@ -94,36 +94,37 @@ def probability_below_zero(mean: np.ndarray, deviation: np.ndarray) -> np.ndarra
 def fit(
     z: np.ndarray,
     distance: np.ndarray,
-    failing: np.ndarray,
+    hidden: np.ndarray,
     before: Surrogate | None = None,
     warp: float = math.inf,
     rounds: int = ROUNDS,
 ) -> Surrogate:
-    """The `Surrogate` of points ``z`` [n, D] with ``distance`` [n] where not ``failing`` [n];
+    """The `Surrogate` of points ``z`` [n, D] with ``distance`` [n] where not ``hidden`` [n];
     ``before``: one of the first of them, to start from.
     """
-    safe = ~failing
-    t = distance if math.isinf(warp) else warp * np.log1p(distance / warp)
-    seen = t[safe] if safe.any() else np.ones(1)
-    scale = max(float(seen.std()), 0.1 * float(np.abs(seen).mean()), 1e-300)
-    t = np.where(failing, 0.0, t / scale)
+    seen = ~hidden
+    size = np.abs(distance)
+    t = distance if math.isinf(warp) else np.sign(distance) * warp * np.log1p(size / warp)
+    values = t[seen] if seen.any() else np.ones(1)
+    scale = max(float(values.std()), 0.1 * float(np.abs(values).mean()), 1e-300)
+    t = np.where(hidden, 0.0, t / scale)
     prior = _prior(z.shape[1])
     logs = prior.mean if before is None else before.logs
-    tau, nu = np.where(failing, UNSEEN_PRECISION, 1.0), np.zeros(len(z))
+    tau, nu = np.where(hidden, UNSEEN_PRECISION, 1.0), np.zeros(len(z))
     if before is not None:
         for new, old in zip((tau, nu), before.sites, strict=True):
             new[: len(old)] = old
     for i in range(rounds + 1):
         noise, k = math.exp(logs[2]), covariance(z, z, logs)[0]
-        tau, nu = np.where(failing, tau, 1 / noise), np.where(failing, nu, t / noise)
-        tau, nu = _fit_sites(k, tau, nu, failing, noise)
+        tau, nu = np.where(hidden, tau, 1 / noise), np.where(hidden, nu, t / noise)
+        tau, nu = _fit_sites(k, tau, nu, hidden, noise)
         if i < rounds:
-            logs = _climb(z, nu / tau, 1 / tau, failing, logs, prior)
+            logs = _climb(z, nu / tau, 1 / tau, hidden, logs, prior)
     inverse = np.linalg.inv(_with_noise(k, 1 / tau))
-    value = _evidence(k, tau, nu, failing, noise) + prior.log_density(logs)
+    value = _evidence(k, tau, nu, hidden, noise) + prior.log_density(logs)
     # densities of the distances themselves: the derivative of the warp and the scale
-    log_slope = 0.0 if math.isinf(warp) else np.log1p(distance[safe] / warp).sum()
-    value -= log_slope + safe.sum() * math.log(scale)
+    log_slope = 0.0 if math.isinf(warp) else np.log1p(size[seen] / warp).sum()
+    value -= log_slope + seen.sum() * math.log(scale)
     return Surrogate(
         z=z,
         logs=logs,
