@@ -19,7 +19,7 @@ from jast import blackbox
 from jast._src.blackbox import answers, worker
 from jast._src.core.rewards import STANDARD
 from jast._src.estimate.tilts.exploration import numbers_of_episodes
-from jast._src.runtime.host_errors import GROUPS, Log, new_incidents, sources
+from jast._src.runtime.host_errors import GROUPS, Log, hosts_of, new_incidents
 from jast.distributions import Categorical, Independent, Joint, MultivariateNormalDiag, Normal
 from jast.incidents import incidents
 
@@ -125,7 +125,7 @@ def test_check_says_where_failures_on_the_way_are_lost():
         assert jast.check(sim) is sim
     lost = int(str(said[0].message).split()[2])
     before = blackbox.calls(sim)
-    host = next(sources(sim, "compare")).host
+    host = next(hosts_of(sim))
     # the first comes back, the last at the end; the others stay near, or are away at their end
     rows = np.zeros((6, 8))
     rows[5, -2:] = 5, -5

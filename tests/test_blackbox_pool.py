@@ -18,7 +18,7 @@ import jast
 from jast import blackbox
 from jast._src.blackbox import pool
 from jast._src.blackbox.pool import Pool
-from jast._src.runtime.host_errors import sources
+from jast._src.runtime.host_errors import hosts_of
 from jast.distributions import Normal
 from jast.incidents import incidents
 
@@ -129,7 +129,7 @@ def test_check_looks_on_the_way_in_a_worker():
         said.append([str(w.message) for w in warned])
     assert said[0] == said[1]
     # what gives no answer is not compared
-    host = next(sources(box(Hangs, **settings), "compare")).host
+    host = next(hosts_of(box(Hangs, **settings)))
     assert host.lost([], [np.ones((2, 8))]) == 0
 
 

@@ -9,8 +9,8 @@ import jax.numpy as jnp
 from jax import lax
 
 from jast import distributions as D
-from jast._src.blackbox.host_calls import Host
 from jast._src.core.simulator import Simulator
+from jast._src.runtime.host_errors import hosts_of
 from jast._src.util.pytrees import select
 
 __all__ = ["compare"]
@@ -19,15 +19,19 @@ EPISODES = 16  # half of them drawn from the model, half from its tails, where f
 TAIL = 0.02  # the probability of both tails together
 
 
-def compare(host: Host, sim: Simulator) -> None:
-    """Warn (UserWarning) where episodes of ``sim`` fail on the way and no longer at the end.
+def compare(sim: Simulator) -> None:
+    """Warn (UserWarning) where episodes of ``sim``, whose objects are judged at the end only, fail
+    on the way and no longer at the end.
 
     Runs `EPISODES` more episodes, looked at after every disturbance. An ``is_event`` that raises
     before the end is not compared.
     """
-    drawn = jax.device_get(_draw(jax.random.key(2), sim))
-    lost = host.lost(*map(jax.tree.leaves, drawn))
-    if lost:
+    for host in hosts_of(sim):
+        if host.spec.run or not host.spec.episodic:
+            continue
+        drawn = jax.device_get(_draw(jax.random.key(2), sim))
+        if not (lost := host.lost(*map(jax.tree.leaves, drawn))):
+            continue
         warnings.warn(
             f"from_python: in {lost} of {EPISODES} episodes is_event() is True during the episode"
             " and False at its end; with episodic=True these do not count as failures. If"

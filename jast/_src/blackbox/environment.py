@@ -145,10 +145,8 @@ def gymnasium_system(
         (5, 1)
     """
     seed = whole_number("gymnasium_system", "seed", seed, 0)
-    needed, optional = (
-        dict(make=make, distance=distance),
-        dict(event=event, agent=agent, apply=apply),
-    )
+    needed = dict(make=make, distance=distance)
+    optional = dict(event=event, agent=agent, apply=apply)
     for name, value in (needed | optional).items():
         if not (callable(value) or name in optional and value is None):
             raise ValueError(f"gymnasium_system: {name} must be a function, received {value!r}")

@@ -78,11 +78,10 @@ class Host:
     def __reduce__(self):  # another process counts for itself
         return Host, (self.runner, self.spec, self.x, self.starts, self.size)
 
-    def incidents(self):
-        return self.log.all()
-
-    def calls(self):
-        return self.done
+    def count(self, **more):
+        """Add to what has been done so far."""
+        now = {name: getattr(self.done, name) + number for name, number in more.items()}
+        self.done = self.done._replace(**now)
 
     @contextlib.contextmanager
     def keep_runs(self, store, name):
@@ -159,10 +158,7 @@ class Host:
             with self.lock:
                 begin = time.perf_counter()
                 found = self._answer(rows, t, leaves[: self.starts], leaves[self.starts :], dtype)
-                self.done = self.done._replace(
-                    calls=self.done.calls + 1,
-                    seconds=self.done.seconds + time.perf_counter() - begin,
-                )
+                self.count(calls=1, seconds=time.perf_counter() - begin)
             for whole, part in zip(out, found):
                 whole[rows] = part
         return tuple(a.reshape((*batch, *a.shape[1:])) for a in out)
@@ -175,10 +171,7 @@ class Host:
         with self.lock:
             on_the_way, at_the_end = self.runner.judge(*rows).T
             n = len(on_the_way)
-            self.done = self.done._replace(
-                episodes=self.done.episodes + n,
-                transitions=self.done.transitions + n * self.spec.horizon,
-            )
+            self.count(episodes=n, transitions=n * self.spec.horizon)
         return int(np.sum(on_the_way & ~at_the_end))
 
     def _answer(self, lanes, t, x0, xs, dtype):
@@ -188,13 +181,8 @@ class Host:
         keys = keys_of(x0, xs, t)
         known = [self.answers.get(key) for key in keys]
         rows = self._to_run(keys, known, t)
-        if len(rows):
-            answers = self._run(keys, rows, lanes, t, x0, xs, dtype)
-        else:
-            answers = {}
-        self.done = self.done._replace(
-            rows=self.done.rows + len(t), known=self.done.known + len(t) - len(rows)
-        )
+        answers = self._run(keys, rows, lanes, t, x0, xs, dtype) if len(rows) else {}
+        self.count(rows=len(t), known=len(t) - len(rows))
         found = [answers.get(i) or answers.get(keys[i]) or a for i, a in enumerate(known)]
         with np.errstate(over="ignore"):
             distance, log_p = (
@@ -234,10 +222,7 @@ class Host:
         t, lanes = t[rows], lanes[rows]
         x0, xs = [a[rows] for a in x0], [a[rows] for a in xs]
         reply = self.runner(t, x0, xs, lanes)
-        self.done = self.done._replace(
-            episodes=self.done.episodes + reply.episodes,
-            transitions=self.done.transitions + reply.transitions,
-        )
+        self.count(episodes=reply.episodes, transitions=reply.transitions)
 
         def example(i):
             return (

@@ -104,13 +104,6 @@ def _close(workers):
         each.kill()
 
 
-def _configure_pool(payload, workers, spec, x, size):
-    """A `Pool`."""
-    made = Pool(payload, workers, spec)
-    made.configure(x, size)
-    return made
-
-
 class _Piece(NamedTuple):
     """Rows that a worker runs."""
 
@@ -132,15 +125,15 @@ class Pool:
     of a process.
     """
 
-    def __init__(self, payload, workers, spec):
+    def __init__(self, payload, workers, spec, x=0, size=0):
         self.payload, self.spec = payload, spec
         self.workers = [Worker(payload) for _ in range(workers)]
-        self.x, self.size = 0, 0
+        self.configure(x, size)
         self.pace: float | None = None  # seconds a row
         weakref.finalize(self, _close, self.workers)
 
     def __reduce__(self):  # another process has workers of its own
-        return _configure_pool, (self.payload, len(self.workers), self.spec, self.x, self.size)
+        return Pool, (self.payload, len(self.workers), self.spec, self.x, self.size)
 
     def configure(self, x, size):
         """As `worker.Runner.configure`, for all workers."""

@@ -14,10 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from jast import distributions as D
-from jast._src.blackbox.compare import compare
 from jast._src.blackbox.host_calls import Calls, Host
 from jast._src.blackbox.pool import Pool, pack
-from jast._src.blackbox.snapshots import BranchingRunner
 from jast._src.blackbox.worker import METHODS, Runner, Spec, takes
 from jast._src.core.check import OBSERVED
 from jast._src.core.simulator import Simulator, fixed, translating
@@ -25,7 +23,7 @@ from jast._src.core.typing import Array, ArrayTree, DistributionLike, Disturbanc
 from jast._src.distributions.containers import accepted
 from jast._src.distributions.special import Seeds
 from jast._src.runtime._jax import host_call
-from jast._src.runtime.host_errors import sources
+from jast._src.runtime.host_errors import Asking, hosts_of
 from jast._src.util.checks import number, whole_number
 from jast._src.util.pytrees import select, shapes_text
 
@@ -204,10 +202,8 @@ def from_python(
         >>> int(jast.rollout(jax.random.key(0), sim).length) <= 10
         True
     """
-    horizon, workers = (
-        whole_number(NAME, "horizon", horizon),
-        whole_number(NAME, "workers", workers, 0),
-    )
+    horizon = whole_number(NAME, "horizon", horizon)
+    workers = whole_number(NAME, "workers", workers, 0)
     if episodic is not None and not isinstance(episodic, bool):
         raise ValueError(f"{NAME}: episodic must be True, False or None, received {episodic!r}")
     if time_limit is not None:
@@ -259,10 +255,10 @@ def from_python(
     )
     if episodic:
         judge = _judge if tells is None else _judge_with_log_p
-        return Simulator(begin, _extend, evaluate=_Asking(host, judge), **fields)
+        return Simulator(begin, _extend, evaluate=Asking(host, judge), **fields)
     return Simulator(
         lambda x0: _with_outcome(host, begin(x0)),
-        _Asking(host, _transition),
+        Asking(host, _transition),
         evaluate=_outcome if tells is None else _outcome_and_log_p,
         is_terminal=lambda state: state.terminal,
         **fields,
@@ -290,31 +286,13 @@ def calls(sim: Simulator) -> Calls:
         >>> jast.blackbox.calls(sim).episodes >= 50
         True
     """
-    counts = [source.calls() for source in sources(sim, "calls")]
+    counts = [host.done for host in hosts_of(sim)]
     if not counts:
         raise ValueError(
             "calls: sim must be a simulator of jast.blackbox.from_python, received one that runs"
             " nothing on the host"
         )
     return Calls(*map(sum, zip(*counts)))
-
-
-class _Asking:
-    """A field of a simulator that asks the host."""
-
-    def __init__(self, host, function):
-        self.host, self.function = host, function
-        self.incidents, self.calls = host.incidents, host.calls
-        self.failing, self.workers = host.failing, host.workers
-        self.keep_runs, self.tell_runs = host.keep_runs, host.tell_runs
-        self.runs_apart = host.runs_apart
-        if host.spec.episodic and not host.spec.run:
-            self.compare = partial(compare, host)
-        if not host.spec.episodic:
-            self.branching = partial(BranchingRunner, host)
-
-    def __call__(self, *args):
-        return self.function(self.host, *args)
 
 
 def _judge(host, state):

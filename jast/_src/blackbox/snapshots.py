@@ -50,8 +50,7 @@ class BranchingRunner(Runner):
                 "splitting: sim must be a black box with workers=0, whose objects are in this"
                 " process; for several processes give executor="
             )
-        super().__init__(host.runner.system, host.spec)
-        self.configure(host.runner.x, host.runner.size)
+        super().__init__(host.runner.system, host.spec, host.runner.x, host.runner.size)
         self.host = host
 
     def begin(self, x0: Sequence[np.ndarray]) -> tuple[Any, Look]:
@@ -101,18 +100,15 @@ class BranchingRunner(Runner):
         host, begun = self.host, time.perf_counter()
         try:
             thing, log_p, answer = ask()
-            event, distance, terminal, log_p, seen = self._look(thing, log_p, answer)
-            look = Look(event, distance, terminal, log_p, np.zeros(0) if seen is None else seen)
+            *outcome, seen = self._look(thing, log_p, answer)
+            look = Look(*outcome, np.asarray(seen))
         except KeyboardInterrupt:
             raise
         except BaseException as error:  # SystemExit too: the system's, not ours
             thing, look = None, Look(False, np.nan, True, 0.0, np.zeros(self.size))
             host.log.add(*said(error), partial(self._example, x0, xs))
         with host.lock:
-            counts |= dict(calls=1, rows=1, seconds=time.perf_counter() - begun)
-            host.done = host.done._replace(
-                **{name: getattr(host.done, name) + more for name, more in counts.items()}
-            )
+            host.count(calls=1, rows=1, seconds=time.perf_counter() - begun, **counts)
         return thing, look
 
     def _example(self, x0, xs):

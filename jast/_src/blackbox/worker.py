@@ -42,13 +42,19 @@ NAME = "jast_blackbox_worker"  # the module that a worker process keeps its syst
 class WrongAnswer(Exception):
     """The system answered something else than what was asked."""
 
+    kind = "wrong answer"
+
 
 class NotANumber(Exception):
     """The system answered NaN or infinity."""
 
+    kind = "NaN"
+
 
 class TimedOut(BaseException):
     """Not an Exception, so that the system's own ``except Exception`` does not stop it."""
+
+    kind = "timed out"
 
 
 class Spec(NamedTuple):
@@ -116,26 +122,21 @@ def takes(function, count):
     return True
 
 
-def _configure_runner(system, spec, x, size):
-    made = Runner(system, spec)
-    made.configure(x, size)
-    return made
-
-
 class Runner:
     """A system and the objects that it has made."""
 
-    def __init__(self, system, spec):
+    def __init__(self, system, spec, x=0, size=0):
+        """``x``, ``size``: as `configure` has them."""
         self.system, self.spec = system, spec
         self.kept: dict[tuple, list] = {}  # history -> objects that have it
         self.count = 0  # of these
         self.spare: list = []  # objects for new episodes
-        self.x, self.size = 0, 0
+        self.configure(x, size)
         self.episodes = self.transitions = 0
         self.alarm = Alarm(spec.limit)
 
     def __reduce__(self):  # another process makes objects of its own
-        return _configure_runner, (self.system, self.spec, self.x, self.size)
+        return Runner, (self.system, self.spec, self.x, self.size)
 
     def configure(self, x, size):
         """``x``: the structure of a disturbance, like ``x0`` of `Spec`; ``size``: how many numbers
@@ -177,34 +178,24 @@ class Runner:
         """`Reply` for rows of ``t`` [n] disturbances each; ``x0``: leaves [n, ...], ``xs``: leaves
         [n, >= t, ...].
         """
-        n = len(t)
-        event, distance, terminal, log_p, seen = blank(n, self.size)
-        problems, begin = [], time.perf_counter()
+        outcomes, problems = blank(len(t), self.size), []
+        begin = time.perf_counter()
         self.episodes = self.transitions = 0
         one = self._episode if self.spec.episodic else self._step
-        for i in range(n):
+        for i in range(len(t)):
             try:
-                event[i], distance[i], terminal[i], log_p[i], observed = one(
+                found = one(
                     int(t[i]), [np.array(a[i]) for a in x0], [np.array(a[i, : t[i]]) for a in xs]
                 )
-                if self.size:
-                    seen[i] = observed
+                for array, value in zip(outcomes, found):
+                    array[i] = value
             except KeyboardInterrupt:
                 raise
             except BaseException as error:  # SystemExit too: the system's, not ours
-                terminal[i] = True
+                outcomes[2][i] = True  # terminal
                 problems.append((i, *said(error)))
-        return Reply(
-            event=event,
-            distance=distance,
-            terminal=terminal,
-            log_p=log_p,
-            seen=seen,
-            problems=problems,
-            episodes=self.episodes,
-            transitions=self.transitions,
-            seconds=time.perf_counter() - begin,
-        )
+        seconds = time.perf_counter() - begin
+        return Reply(*outcomes, problems, self.episodes, self.transitions, seconds)
 
     def judge(self, x0, xs):
         """[n, 2] bool of whole episodes of objects: whether ``is_event`` holds at a state before
@@ -241,7 +232,7 @@ class Runner:
                 expected = ("the pair (event, distance)", "(p, event, distance)")[told]
                 raise WrongAnswer(f"expected {expected}, received {_show(answer)}")
             log_p = self._log_p(answer[0], "p") if told else 0.0
-            return _event(answer[-2]), _distance(answer[-1]), False, log_p, None
+            return _event(answer[-2]), _distance(answer[-1]), False, log_p, ()
         thing = self._fresh()
         with self.alarm:
             thing.initialize(*self._given(x0))
@@ -250,7 +241,7 @@ class Runner:
                 log_p += self._transition(thing, fill(self.x, [a[k] for a in xs]))
             log_p, *outcome = self._outcome(thing, log_p, _evaluate(thing))
         self.spare.append(thing)
-        return *outcome, False, log_p, None
+        return *outcome, False, log_p, ()
 
     def _step(self, t, x0, xs):
         """Event, distance, terminal and observation of the object with this history, which is moved
@@ -286,7 +277,7 @@ class Runner:
         with self.alarm:
             log_p, *outcome = self._outcome(thing, log_p, answer)
             ended = hasattr(thing, "is_terminal") and _event(thing.is_terminal(), "is_terminal")
-            observed = _observed(thing.observe(), self.size) if self.size else None
+            observed = _observed(thing.observe(), self.size) if self.size else ()
         return *outcome, ended, log_p, observed
 
     def _initialize(self, thing, x0):
@@ -423,12 +414,8 @@ def _show(value):
 
 def said(error):
     """(kind, message) of what the system raised."""
-    if isinstance(error, TimedOut):
-        return "timed out", str(error)
-    if isinstance(error, WrongAnswer):
-        return "wrong answer", str(error)
-    if isinstance(error, NotANumber):
-        return "NaN", str(error)
+    if isinstance(error, TimedOut | WrongAnswer | NotANumber):
+        return error.kind, str(error)
     text = " ".join(str(error).split())[:200]
     return "raised", f"raised {type(error).__name__}{f': {text}' if text else ''}{line_of(error)}"
 

@@ -33,7 +33,7 @@ import numpy as np
 from jast._src.core.typing import Array
 from jast._src.io import npz, save_load
 from jast._src.io.fingerprint import describe_differences, fingerprint
-from jast._src.runtime.host_errors import sources
+from jast._src.runtime.host_errors import hosts_of
 
 __all__ = [
     "PARTS",
@@ -238,8 +238,8 @@ def open_checkpoint(
         with _name_errors(function, folder):
             parts = stack.enter_context(RecordFile(folder / PARTS))
         checkpoint = Checkpoint(function, folder, parts)
-        for i, source in enumerate(sources(about.get("sim"), "keep_runs")):
-            stack.enter_context(source.keep_runs(checkpoint, f"runs {i}"))
+        for i, host in enumerate(hosts_of(about.get("sim"))):
+            stack.enter_context(host.keep_runs(checkpoint, f"runs {i}"))
         yield checkpoint
 
 

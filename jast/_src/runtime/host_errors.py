@@ -15,10 +15,12 @@ from jax.tree_util import Partial
 from jast._src.core.simulator import Simulator
 
 __all__ = [
+    "Asking",
     "Incident",
     "KINDS",
     "Log",
     "failing_runs",
+    "hosts_of",
     "in_full_batches",
     "incidents",
     "merge_incidents",
@@ -26,7 +28,6 @@ __all__ = [
     "runs_apart",
     "runs_made",
     "runs_on_host",
-    "sources",
     "telling_runs",
 ]
 
@@ -119,60 +120,70 @@ class Log:
             return tuple(self._groups.values())
 
 
-def sources(sim, name) -> Iterator[Any]:
-    """The functions behind a simulator's fields that have a method ``name``, each once; also those
-    bound by another function's arguments.
+class Asking:
+    """A function of a simulator that asks its ``host``, a `blackbox.host_calls.Host`."""
+
+    def __init__(self, host, function):
+        self.host, self.function = host, function
+
+    def __call__(self, *args):
+        return self.function(self.host, *args)
+
+
+def hosts_of(sim) -> Iterator[Any]:
+    """The hosts that the functions of a simulator ask, each once; also those that a function asks
+    which is bound by another one's arguments.
     """
     seen, left = set(), [sim]
     while left:
         for part in jax.tree.leaves(left.pop(), is_leaf=lambda p: isinstance(p, Partial)):
             if isinstance(part, Partial):
                 left.append((part.args, part.keywords))
-                if callable(getattr(part.func, name, None)) and id(part.func) not in seen:
-                    seen.add(id(part.func))
-                    yield part.func
+                if isinstance(part.func, Asking) and id(part.func.host) not in seen:
+                    seen.add(id(part.func.host))
+                    yield part.func.host
 
 
 def runs_on_host(sim):
     """Whether the simulator runs on the host: a black box, slow and without gradients."""
-    return any(True for _ in sources(sim, "incidents"))
+    return any(True for _ in hosts_of(sim))
 
 
 def runs_made(sim):
     """How often the host code behind a simulator has started to run so far: 0 of one in JAX."""
-    return sum(source.calls().episodes for source in sources(sim, "calls"))
+    return sum(host.done.episodes for host in hosts_of(sim))
 
 
 def failing_runs(sim):
     """The runs of a black box that failed so far, each once, as its workplace keeps them."""
-    return [run for source in sources(sim, "failing") for run in source.failing()]
+    return [run for host in hosts_of(sim) for run in host.failing()]
 
 
-@contextlib.contextmanager
 def runs_apart(sim):
     """A context in which a black box does not know the answers from before; after it, it knows
     both.
     """
-    with contextlib.ExitStack() as stack:
-        for source in sources(sim, "runs_apart"):
-            stack.enter_context(source.runs_apart())
-        yield
+    return _all_of(host.runs_apart() for host in hosts_of(sim))
 
 
-@contextlib.contextmanager
 def telling_runs(sim, told):
     """A context in which ``told(failing)`` is called after each batch of runs of a black box, with
     the number of failing ones in it.
     """
+    return _all_of(host.tell_runs(told) for host in hosts_of(sim))
+
+
+@contextlib.contextmanager
+def _all_of(contexts):
     with contextlib.ExitStack() as stack:
-        for source in sources(sim, "tell_runs"):
-            stack.enter_context(source.tell_runs(told))
+        for context in contexts:
+            stack.enter_context(context)
         yield
 
 
 def in_full_batches(sim, least):
     """The least number of runs, ``least`` or more, that keeps all workers of a simulator busy."""
-    workers = max((source.workers() for source in sources(sim, "workers")), default=1)
+    workers = max((host.workers() for host in hosts_of(sim)), default=1)
     return -(-least // workers) * workers
 
 
@@ -190,7 +201,7 @@ def incidents(sim: Simulator) -> tuple[Incident, ...]:
         >>> jast.incidents.incidents(jast.simulators.walk1d())
         ()
     """
-    return tuple(i for source in sources(sim, "incidents") for i in source.incidents())
+    return tuple(i for host in hosts_of(sim) for i in host.log.all())
 
 
 def merge_incidents(first, second):

@@ -7,9 +7,10 @@ from typing import Any
 import jax
 import numpy as np
 
+from jast._src.blackbox.snapshots import BranchingRunner
 from jast._src.core.simulator import Simulator
 from jast._src.estimate.splitting.object_paths import ObjectPaths
-from jast._src.runtime.host_errors import sources
+from jast._src.runtime.host_errors import hosts_of
 
 __all__ = ["branching_objects", "check_objects"]
 
@@ -18,16 +19,16 @@ def branching_objects(name: str, sim: Simulator) -> Any:
     """What saves and resumes the objects of a black box; None for a simulator in JAX. ValueError
     for a black box without objects in this process.
     """
-    if next(sources(sim, "calls"), None) is None:
+    host = next(hosts_of(sim), None)
+    if host is None:
         return None
-    found = next(sources(sim, "branching"), None)
-    if found is None:
+    if host.spec.episodic:
         raise ValueError(
             f"{name}: sim must be a black box of objects that are judged at every state"
             " (episodic=False), since a function of whole episodes cannot be resumed: use"
             " jast.estimate.failure_probability"
         )
-    return found.branching()
+    return BranchingRunner(host)
 
 
 def check_objects(name: str, key: jax.Array, sim: Simulator, objects: Any) -> int:
