@@ -5,6 +5,8 @@ for it. Goes to the workers by value.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -36,8 +38,9 @@ class Moment(NamedTuple):
     """The environment itself, for what it does not return."""
 
 
-class _System(NamedTuple):
-    """Makes the objects of one environment."""
+@dataclass(eq=False)
+class _Environment:
+    """The methods that `from_python` asks for."""
 
     make: Callable[[], Any]
     agent: Callable[[Any], Any] | None
@@ -46,18 +49,11 @@ class _System(NamedTuple):
     distance: Callable[[Moment], float]
     seed: int
 
-    def __call__(self):
-        return _Environment(self)
-
-
-class _Environment:
-    """The methods that `from_python` asks for."""
-
-    def __init__(self, system):
-        self.system, self.env = system, system.make()
+    def __post_init__(self):
+        self.env = self.make()
 
     def initialize(self, x0=None):
-        seed = self.system.seed if x0 is None else x0
+        seed = self.seed if x0 is None else x0
         if np.shape(seed) != () or np.asarray(seed).dtype.kind not in "iu":
             raise ValueError(
                 "gymnasium_system: x0 is the seed of the environment, a whole number, received"
@@ -69,9 +65,8 @@ class _Environment:
     def transition(self, x):
         if self.is_terminal():
             return
-        agent, apply = self.system.agent, self.system.apply
-        action = None if agent is None else agent(self.now.observation)
-        action = x if apply is None else apply(action, x)
+        action = None if self.agent is None else self.agent(self.now.observation)
+        action = x if self.apply is None else self.apply(action, x)
         observation, reward, terminated, truncated, info = self.env.step(action)
         self.now = Moment(
             observation=observation,
@@ -84,10 +79,10 @@ class _Environment:
         )
 
     def is_event(self):
-        return bool(self.system.event(self.now))
+        return bool(self.event(self.now))
 
     def miss_distance(self):
-        return self.system.distance(self.now)
+        return self.distance(self.now)
 
     def is_terminal(self):
         return self.now.terminated or self.now.truncated
@@ -156,7 +151,7 @@ def gymnasium_system(
             " without it no disturbance reaches the environment"
         )
     event = _terminated if event is None else event
-    return _System(make=make, agent=agent, apply=apply, event=event, distance=distance, seed=seed)
+    return partial(_Environment, **(needed | optional | dict(event=event)), seed=seed)
 
 
 def _terminated(moment):

@@ -146,13 +146,8 @@ class Host:
 
         live = flat(live)
         rows = np.flatnonzero(live)
-        out = (
-            np.zeros(len(live), bool),
-            np.zeros(len(live), dtype),
-            np.zeros(len(live), bool),
-            np.zeros(len(live), dtype),
-            np.zeros((len(live), size), dtype),
-        )
+        out = [np.zeros(len(live), kind) for kind in (bool, dtype, bool, dtype)]
+        out.append(np.zeros((len(live), size), dtype))
         if len(rows):
             t, *leaves = (flat(a)[rows] for a in (t, *leaves))
             with self.lock:
@@ -184,16 +179,11 @@ class Host:
         answers = self._run(keys, rows, lanes, t, x0, xs, dtype) if len(rows) else {}
         self.count(rows=len(t), known=len(t) - len(rows))
         found = [answers.get(i) or answers.get(keys[i]) or a for i, a in enumerate(known)]
+        event, distance, terminal, log_p, seen = zip(*found, strict=True)
+        event, terminal = np.array(event, bool), np.array(terminal, bool)
         with np.errstate(over="ignore"):
-            distance, log_p = (
-                np.array([getattr(a, name) for a in found]).astype(dtype)
-                for name in ("distance", "log_p")
-            )
-        event, terminal = (
-            np.array([getattr(a, name) for a in found], bool) for name in ("event", "terminal")
-        )
-        seen = np.frombuffer(b"".join(a.seen for a in found), np.float64)
-        seen = seen.reshape(len(t), self.size).astype(dtype)
+            distance, log_p = (np.array(a).astype(dtype) for a in (distance, log_p))
+        seen = np.frombuffer(b"".join(seen), np.float64).reshape(len(t), self.size).astype(dtype)
         wrong = ~np.isfinite(distance)  # too large for the dtype, too
         distance[wrong], log_p[wrong] = np.nan, 0
         return event & ~wrong, distance, terminal | wrong, log_p, seen

@@ -90,9 +90,6 @@ class Worker:
             )
             return self.executor.submit(pickle.loads, self.payload)
 
-    def submit(self, function, *args):
-        return self.executor.submit(function, *args)
-
     def kill(self):
         executor, self.executor = self.executor, None
         if executor is not None:
@@ -140,13 +137,13 @@ class Pool:
         self.x, self.size = x, size
         for w in self.workers:
             if w.executor is not None:
-                w.submit(CONFIGURE, x, size)
+                w.executor.submit(CONFIGURE, x, size)
 
     def probe(self, x0):
         """As `worker.Runner.probe`, in the first worker."""
         try:
             self._start(self.workers[:1])
-            return self.workers[0].submit(PROBE, x0).result(timeout=START)
+            return self.workers[0].executor.submit(PROBE, x0).result(timeout=START)
         except Exception as error:
             self.workers[0].kill()
             return _cause(error)
@@ -159,7 +156,7 @@ class Pool:
         limit = None if self.spec.limit is None else n * self.spec.limit + GRACE
         self._start(self.workers[:1])
         try:
-            return self.workers[0].submit(JUDGE, x0, xs).result(timeout=limit)
+            return self.workers[0].executor.submit(JUDGE, x0, xs).result(timeout=limit)
         except Exception:
             self.workers[0].kill()
             return np.zeros((n, 2), bool)
@@ -169,9 +166,7 @@ class Pool:
         batch, which a search keeps from step to step.
         """
         n = len(t)
-        reply = worker.Reply(
-            *worker.blank(n, self.size), problems=[], episodes=0, transitions=0, seconds=0.0
-        )
+        reply = worker.Reply(*worker.blank(n, self.size), problems=[])
         queues = self._pieces(lanes)
         free, busy = set(self.workers), {}
         try:
@@ -185,7 +180,7 @@ class Pool:
                 for w, queue, rows in given:
                     longest = t[rows].max()
                     leaves = [a[rows] for a in x0], [a[rows, :longest] for a in xs]
-                    task = w.submit(SERVE, t[rows], *leaves)
+                    task = w.executor.submit(SERVE, t[rows], *leaves)
                     busy[task] = _Piece(w, queue, rows, self._deadline(t[rows]))
                     free.remove(w)
                 first = min(piece.deadline for piece in busy.values())
@@ -243,7 +238,7 @@ class Pool:
         try:
             for w, task in starting:
                 task.result(timeout=START)
-                w.submit(CONFIGURE, self.x, self.size)
+                w.executor.submit(CONFIGURE, self.x, self.size)
         except Exception as error:
             _close(self.workers)
             raise Unloadable(

@@ -93,10 +93,10 @@ class Reply(NamedTuple):
     """[n, k] float64: what ``observe`` returned"""
     problems: list
     """(row, kind, message)"""
-    episodes: int
+    episodes: int = 0
     """Starts of the system"""
-    transitions: int
-    seconds: float
+    transitions: int = 0
+    seconds: float = 0.0
 
 
 def fill(structure, leaves):

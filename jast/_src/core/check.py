@@ -275,11 +275,8 @@ def _box(box, x):
     for side, end in zip(("low", "high"), box.ends(x), strict=True):
         shapes = map(jnp.shape, jax.tree.leaves(end))
         for leaf, shape in zip(jax.tree.leaves(x), shapes, strict=True):
-            try:
-                fits = np.broadcast_shapes(shape, leaf.shape) == leaf.shape
-            except ValueError:
-                fits = False
-            if not fits:
+            axes = zip(reversed(shape), reversed(leaf.shape))
+            if len(shape) > leaf.ndim or any(a not in (1, b) for a, b in axes):
                 raise ValueError(
                     f"actions.uniform: {side} has shape {shape}, expected one that broadcasts to"
                     f" the disturbance's {leaf.shape}"

@@ -42,7 +42,7 @@ def _seed(seed):
 
 def _fold_in(key, data):
     data = lax.convert_element_type(data, jnp.uint32)
-    first = _mix(_mix(data * jnp.uint32(0x9E3779B9) + key[0]) ^ key[1])
+    first = _word(key, data)
     return jnp.stack([first, _mix(first + key[1] * jnp.uint32(0xCC9E2D51) + data)])
 
 

@@ -79,9 +79,7 @@ class Failures:
         return len(self.counts)
 
     def __getitem__(self, i: int | slice) -> Episode | Failures:
-        if not isinstance(i, slice):
-            return self.episode(index(i))
-        return self.take(i)
+        return self.take(i) if isinstance(i, slice) else self.episode(index(i))
 
     def take(self, rows: slice | np.ndarray) -> Failures:
         """The archive of these ``rows``, a slice or rising numbers."""
@@ -242,19 +240,19 @@ def collect(
     tree = _numbers("tree", np.zeros(m, np.int32) if tree is None else tree, m)
     simulation = _numbers("simulation", np.arange(m) if simulation is None else simulation, m)
 
-    # a replay is None where it does not fail
-    replays, found = {}, []
-    for i in np.flatnonzero(episodes.failure):
+    replays, rows, kept = {}, [], []
+    failing = np.flatnonzero(episodes.failure)
+    for i in failing:
         candidate = _take(episodes, i)
         name = identity(candidate)
         if name not in replays:
             again = jax.device_get(replay(sim, candidate, reward=reward)._replace(states=None))
-            replays[name] = jax.tree.map(np.asarray, again) if again.failure else None
-        found.append((i, replays[name]))
-    rows = [i for i, again in found if again is not None]
+            replays[name] = jax.tree.map(np.asarray, again)
+        if replays[name].failure:
+            rows.append(i)
+            kept.append(replays[name])
     archive = empty(sim)
     if rows:
-        kept = [again for _, again in found if again is not None]
         archive = Failures(
             episodes=jax.tree.map(lambda *leaves: np.stack(leaves), *kept),
             counts=np.ones(len(rows), np.int32),
@@ -264,7 +262,7 @@ def collect(
             dropped=0,
         )
     return _best("collect", archive, top).replace(
-        seen=len(found) if seen is None else int(seen), dropped=len(found) - len(rows)
+        seen=len(failing) if seen is None else int(seen), dropped=len(failing) - len(rows)
     )
 
 

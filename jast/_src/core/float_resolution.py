@@ -173,9 +173,7 @@ def _five_paths(sim: Simulator, steps: int, keys: jax.Array) -> tuple[Any, ...]:
     when = (seed % max(steps // 2, 1)).astype(jnp.int32)
     which = jnp.arange(5, dtype=jnp.int32)
     state = sim.init(D.sample(sim.start(), key_of(keys[0])))
-    states = jax.tree.map(
-        lambda a: jnp.broadcast_to(jnp.asarray(a)[None], (5, *jnp.shape(a))), state
-    )
+    states = jax.tree.map(lambda a: jnp.broadcast_to(a, (5, *jnp.shape(a))), state)
     widens = signature_of(sim).disturbance.closed  # where that costs no more
 
     def step(i, t, state):

@@ -7,6 +7,7 @@ of one key that says what it is. Arrays are named, and stand beside it.
 
 import dataclasses
 import importlib
+import pkgutil
 from typing import Any, NamedTuple
 
 import jax
@@ -259,8 +260,7 @@ def _record(path: Any, name: str, fields: dict[str, Any], given: Given) -> Any:
         return importlib.import_module(WITH_FUNCTIONS[name]).whole(path, fields, given)
     if name == "Failures" and given.sim is not None:
         check_episodes(path, given.sim, fields["episodes"])
-    module, _, attribute = RECORDS[name].partition(":")
-    return getattr(importlib.import_module(module), attribute)(**fields)
+    return pkgutil.resolve_name(RECORDS[name])(**fields)
 
 
 def _children_of(node: Any) -> tuple[list[str], list | None]:

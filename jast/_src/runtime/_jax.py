@@ -24,7 +24,7 @@ import functools
 import inspect
 import os
 from collections.abc import Callable, Iterator, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -132,6 +132,13 @@ def _compiled(function, wanted, how, options):
 
     run.eval_shape, run.lower = whole.eval_shape, whole.lower
     return functools.wraps(function)(run)
+
+
+def define_prng_impl(**parts: Any) -> Any:
+    """A key implementation of its ``parts``, as `jax.extend.random.define_prng_impl` takes them."""
+    from jax.extend.random import define_prng_impl  # here: jax.extend loads Pallas
+
+    return define_prng_impl(**parts)
 
 
 def reset_cache() -> None:
@@ -275,15 +282,3 @@ def _unstopped(closed: Any) -> Any:
             equations.append(equation.replace(invars=given, params=params))
     outvars = [seen(v) for v in closed.jaxpr.outvars]
     return closed.replace(jaxpr=closed.jaxpr.replace(eqns=equations, outvars=outvars))
-
-
-if TYPE_CHECKING:
-    from jax.extend.random import define_prng_impl
-
-
-def __getattr__(name: str) -> Any:
-    if name == "define_prng_impl":
-        from jax.extend.random import define_prng_impl
-
-        return define_prng_impl
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -69,7 +69,7 @@ class Record(NamedTuple):
     end: int
 
 
-class RecordFile:
+class RecordFile(contextlib.AbstractContextManager):
     """The records of a file by their names, the last one of a name. Only one process may have it
     open. A part is a record and not a file, as making a file costs ten times as much.
     """
@@ -79,9 +79,6 @@ class RecordFile:
         self._file, self._lock = open(path, "a+b", buffering=0), threading.Lock()
         self._records = {r.header["name"]: r for r in read_records(path)}
         self._file.truncate(max((r.end for r in self._records.values()), default=0))
-
-    def __enter__(self) -> RecordFile:
-        return self
 
     def __exit__(self, *_: object) -> None:
         self._file.close()

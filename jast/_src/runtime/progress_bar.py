@@ -13,7 +13,7 @@ State = TypeVar("State")
 COMPILING = "compiling"  # what a bar says before anything is done: most of that time goes there
 
 
-class Watch:
+class Watch(contextlib.AbstractContextManager):
     """A bar of tqdm and the user's callback; a context manager, which closes the bar."""
 
     def __init__(
@@ -87,9 +87,6 @@ class Watch:
         """Close the bar."""
         if self._bar is not None:
             self._bar.close()
-
-    def __enter__(self) -> "Watch":
-        return self
 
     def __exit__(self, *_: object) -> None:
         self.close()

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -89,12 +90,8 @@ def _with_settings(make, sim, row):
 
 def _can_be_traced(sim):
     """Whether the functions of ``sim`` can be traced with its settings as arguments."""
-
-    def trace(sim):
-        contract("sweep", sim)
-
     try:
-        jax.eval_shape(trace, sim)
+        jax.eval_shape(partial(contract, "sweep"), sim)
     except Exception:  # such as `if gain > 1:`, or an array of `n` numbers
         return False
     return True

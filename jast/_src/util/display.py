@@ -67,7 +67,8 @@ def printable(scalar: str | None = None, batches: bool = False) -> Callable[[C],
             if own is None:
                 return _by_fields(self)
             tells = None if scalar is None else getattr(self, scalar, None)
-            if scalar is None or _prints(tells, batches):
+            concrete = _number(tells) and not is_traced(tells)
+            if scalar is None or (concrete and (batches or np.ndim(tells) == 0)):
                 return own(self)
             return _by_fields(self, _of_many(tells))
 
@@ -145,11 +146,6 @@ def renamed(result: Any, old: str, new: str) -> Any:
 def batch_shape(value: Any) -> tuple[int, ...] | None:
     """The leading axes of what is one number in a single object; None where it has no shape."""
     return tuple(np.shape(value)) if _number(value) or hasattr(value, "shape") else None
-
-
-def _prints(value: Any, batches: bool) -> bool:
-    concrete = _number(value) and not is_traced(value)
-    return concrete and (batches or np.ndim(value) == 0)
 
 
 def _of_many(value: Any) -> str:

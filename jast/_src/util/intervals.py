@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from jast._src.util.checks import real_number
+from jast._src.util.checks import number
 
 __all__ = [
     "checked_level",
@@ -92,8 +92,7 @@ def _exact_interval(k, n, level):
 
 def checked_level(function: str, level: float) -> float:
     """``level`` as a float. ValueError unless it is a number between 0 and 1."""
-    real_number(function, "level", level, lambda v: 0 < v < 1, "between 0 and 1")
-    return float(level)
+    return number(function, "level", level, lambda v: 0 < v < 1, "between 0 and 1")
 
 
 def _check_counts(function, k, n, level):
@@ -101,8 +100,7 @@ def _check_counts(function, k, n, level):
         raise ValueError(f"{function}: n must be a whole number of at least 1, received {n!r}")
     if not (k == int(k) and 0 <= k <= n):
         raise ValueError(f"{function}: k must be a whole number from 0 to n = {n}, received {k!r}")
-    if not 0 < level < 1:
-        raise ValueError(f"{function}: level must lie between 0 and 1, received {level!r}")
+    checked_level(function, level)
 
 
 def chernoff(k: int, n: int, level: float = 0.95) -> float:
@@ -182,12 +180,12 @@ def normal(mean: float, standard_error: float, level: float = 0.95) -> tuple[flo
         >>> [round(end, 2) for end in normal(1.0, 0.1)]
         [0.8, 1.2]
     """
-    real_number("normal", "mean", mean, math.isfinite, "that is finite")
-    real_number(
+    mean = number("normal", "mean", mean, math.isfinite, "that is finite")
+    error = number(
         "normal", "standard_error", standard_error, lambda v: 0 <= v < math.inf, "of at least 0"
     )
-    half = normal_quantile(checked_level("normal", level)) * float(standard_error)
-    return float(mean) - half, float(mean) + half
+    half = normal_quantile(checked_level("normal", level)) * error
+    return mean - half, mean + half
 
 
 def jeffreys(k: int, n: int, level: float = 0.95) -> float:

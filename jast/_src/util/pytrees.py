@@ -18,7 +18,6 @@ __all__ = [
     "count_numbers",
     "conform",
     "map_in_lanes",
-    "map_in_parts",
     "pad_rows",
     "select",
     "shapes_text",
@@ -104,26 +103,16 @@ def pad_rows(rows: Any, length: int) -> Any:
     return jax.tree.map(longer, rows)
 
 
-def map_in_parts(size: int, function: Callable, *trees: Any) -> Any:
-    """``function`` of arrays [n, ...], which goes on them row by row, ``size`` rows at a time; n is
-    a multiple of that. On the host.
-    """
-    n = len(jax.tree.leaves(trees)[0])
-    parts = [
-        function(*jax.tree.map(lambda a, k=k: np.asarray(a)[k : k + size], trees))
-        for k in range(0, n, size)
-    ]
-    return jax.tree.map(lambda *a: np.concatenate(a), *jax.device_get(parts))
-
-
 def map_in_lanes(size: int, function: Callable, *trees: Any) -> Any:
-    """`map_in_parts` for any number n of rows from 1 on: the last part is filled up with rows
-    again, so one program serves every n.
+    """``function`` of arrays [n, ...], n from 1 on, which goes on them row by row, ``size`` rows at
+    a time. The last part is filled up with rows again, so one program serves every n. On the host.
     """
     n = len(jax.tree.leaves(trees)[0])
-    rows = np.arange(-(-n // size) * size) % n
-    found = map_in_parts(size, function, *jax.tree.map(lambda a: np.asarray(a)[rows], trees))
-    return jax.tree.map(lambda a: a[:n], found)
+    parts = (np.arange(-(-n // size) * size) % n).reshape(-1, size)
+    found = [
+        function(*jax.tree.map(lambda a, rows=rows: np.asarray(a)[rows], trees)) for rows in parts
+    ]
+    return jax.tree.map(lambda *a: np.concatenate(a)[:n], *jax.device_get(found))
 
 
 def count_numbers(like: Any) -> int:
