@@ -45,7 +45,7 @@ class _Environment:
     make: Callable[[], Any]
     agent: Callable[[Any], Any] | None
     apply: Callable[[Any, Any], Any] | None
-    event: Callable[[Moment], bool]
+    event: Callable[[Moment], bool] | None
     distance: Callable[[Moment], float]
     seed: int
 
@@ -68,18 +68,12 @@ class _Environment:
         action = None if self.agent is None else self.agent(self.now.observation)
         action = x if self.apply is None else self.apply(action, x)
         observation, reward, terminated, truncated, info = self.env.step(action)
-        self.now = Moment(
-            observation=observation,
-            reward=float(reward),
-            total=self.now.total + float(reward),
-            terminated=bool(terminated),
-            truncated=bool(truncated),
-            info=info,
-            env=self.env,
-        )
+        reward, ends = float(reward), (bool(terminated), bool(truncated))
+        total = self.now.total + reward
+        self.now = Moment(observation, reward, total, *ends, info, self.env)
 
     def is_event(self):
-        return bool(self.event(self.now))
+        return self.now.terminated if self.event is None else bool(self.event(self.now))
 
     def miss_distance(self):
         return self.distance(self.now)
@@ -150,9 +144,4 @@ def gymnasium_system(
             "gymnasium_system: an agent needs apply=, a function (action, disturbance) -> action;"
             " without it no disturbance reaches the environment"
         )
-    event = _terminated if event is None else event
-    return partial(_Environment, **(needed | optional | dict(event=event)), seed=seed)
-
-
-def _terminated(moment):
-    return moment.terminated
+    return partial(_Environment, **needed, **optional, seed=seed)

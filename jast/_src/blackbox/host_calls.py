@@ -59,14 +59,13 @@ class Calls(NamedTuple):
 class Host:
     """Answers the callbacks of one simulator, one at a time."""
 
-    def __init__(self, runner, spec, x, starts, size):
-        """``x``: the structure of a disturbance; ``starts``: how many leaves x0 has; ``size``: how
-        many numbers are observed.
-        """
-        self.runner, self.spec, self.x, self.starts, self.size = runner, spec, x, starts, size
+    def __init__(self, runner, starts):
+        """``runner``: configured; ``starts``: how many leaves x0 has."""
+        self.runner, self.starts = runner, starts
+        self.spec, self.x, self.size = runner.spec, runner.x, runner.size
         self.log = Log()
         self.done = Calls(0, 0, 0, 0, 0.0)
-        self.answers = Answers(size)
+        self.answers = Answers(self.size)
         self.asked_twice: set[bool] = set()  # whether a failure was, and another one
         self.store: Callable[[list], None] | None = None  # of a checkpoint
         self.told: Callable[[int], None] | None = None
@@ -76,7 +75,7 @@ class Host:
         self.callback = cache(lambda dtype, size: partial(self, dtype, size))
 
     def __reduce__(self):  # another process counts for itself
-        return Host, (self.runner, self.spec, self.x, self.starts, self.size)
+        return Host, (self.runner, self.starts)
 
     def count(self, **more):
         """Add to what has been done so far."""

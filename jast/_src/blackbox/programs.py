@@ -28,7 +28,8 @@ class Program(NamedTuple):
     folder: str | None
 
     def __call__(self, disturbances, x0=None):
-        task = json.dumps({"x0": _plain(x0), "disturbances": _plain(disturbances)})
+        given = {"x0": x0, "disturbances": disturbances}
+        task = json.dumps(given, default=lambda a: np.asarray(a).tolist())
         pipes = dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.PIPE)
         # a session of its own, so that what the program has started can be ended with it
         with subprocess.Popen(
@@ -103,11 +104,3 @@ def _end(process):
         os.killpg(process.pid, signal.SIGKILL)
     except (AttributeError, OSError):  # no sessions on this system, or it has just ended
         process.kill()
-
-
-def _plain(tree):
-    if isinstance(tree, dict):
-        return {k: _plain(v) for k, v in tree.items()}
-    if isinstance(tree, tuple | list):
-        return [_plain(v) for v in tree]
-    return None if tree is None else np.asarray(tree).tolist()

@@ -239,9 +239,8 @@ def from_python(
         )
     blank = partial(_blank, episodic, horizon, like0, size)
     like = D.event_like(disturbance) if constant else _shape(disturbance, blank, like)
-    x = _structure("disturbance", like)
-    runner.configure(x, size)
-    host = Host(runner, spec, x, len(jax.tree.leaves(like0)), size)
+    runner.configure(_structure("disturbance", like), size)
+    host = Host(runner, len(jax.tree.leaves(like0)))
 
     def begin(x0):
         return blank(like)._replace(begun=jnp.ones((), bool), x0=x0)

@@ -50,7 +50,7 @@ class BranchingRunner(Runner):
                 "splitting: sim must be a black box with workers=0, whose objects are in this"
                 " process; for several processes give executor="
             )
-        super().__init__(host.runner.system, host.spec, host.runner.x, host.runner.size)
+        super().__init__(host.runner.system, host.spec, host.x, host.size)
         self.host = host
 
     def begin(self, x0: Sequence[np.ndarray]) -> tuple[Any, Look]:

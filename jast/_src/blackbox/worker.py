@@ -426,11 +426,8 @@ def line_of(error):
     frames = traceback.extract_tb(error.__traceback__)
     frames = [f for f in frames if not f.filename.startswith(here)]
     libraries = os.path.dirname(os.__file__), "<frozen"
-    own = [
-        f
-        for f in frames
-        if "site-packages" not in f.filename and not f.filename.startswith(libraries)
-    ] or frames
+    own = [f for f in frames if "site-packages" not in f.filename]
+    own = [f for f in own if not f.filename.startswith(libraries)] or frames
     return f" ({os.path.basename(own[-1].filename)}:{own[-1].lineno})" if own else ""
 
 
