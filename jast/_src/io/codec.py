@@ -116,8 +116,7 @@ def encode(value: Any, arrays: dict[str, np.ndarray], at: str = "result") -> Any
     if (name := name_of(value)) is not None:
         return {"record": [name, {k: below(v, k) for k, v in _fields(name, value).items()}]}
     if type(value) in (tuple, list):
-        kind = "tuple" if isinstance(value, tuple) else "list"
-        return {kind: [below(v, i) for i, v in enumerate(value)]}
+        return {type(value).__name__: [below(v, i) for i, v in enumerate(value)]}
     if type(value) is dict and all(isinstance(k, str) for k in value):
         return {"dict": {k: below(v, k) for k, v in value.items()}}
     names, children = _children_of(value)

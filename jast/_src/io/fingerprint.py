@@ -109,8 +109,7 @@ def _of_function(name: str, function: Any, above: tuple) -> Iterator[tuple[str, 
     else:
         yield name, f"{words} with code {_of_code(code).hexdigest()[:12]}"
     if code is not None and function not in above:
-        cells = zip(code.co_freevars, function.__closure__ or ())
-        for variable, cell in cells:
+        for variable, cell in zip(code.co_freevars, function.__closure__ or ()):
             try:
                 held = cell.cell_contents
             except ValueError:  # not yet assigned

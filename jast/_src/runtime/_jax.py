@@ -177,13 +177,8 @@ def host_call(
         shapes: of the answers, without batch axes.
         args: arrays or numbers.
     """
-    return tuple(
-        _host_call().bind(
-            *map(jnp.asarray, args),
-            callback=callback,
-            shapes=tuple((s.shape, np.dtype(s.dtype)) for s in shapes),
-        )
-    )
+    told = tuple((s.shape, np.dtype(s.dtype)) for s in shapes)
+    return tuple(_host_call().bind(*map(jnp.asarray, args), callback=callback, shapes=told))
 
 
 @functools.cache

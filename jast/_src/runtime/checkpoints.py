@@ -144,13 +144,12 @@ class Checkpoint:
         if found is None:
             return None
         header, data = found
-        buffer = np.frombuffer(data, np.uint8)
         arrays, begin = [], 0
         for dtype, shape in header["arrays"]:
-            end = begin + math.prod(shape) * jnp.dtype(dtype).itemsize
+            flat = np.frombuffer(data, jnp.dtype(dtype), math.prod(shape), begin)
             # a copy: the bytes of an array within others' may lie across what its dtype wants
-            arrays.append(buffer[begin:end].copy().view(jnp.dtype(dtype)).reshape(shape))
-            begin = end
+            arrays.append(flat.copy().reshape(shape))
+            begin += flat.nbytes
         return arrays
 
     def put(self, number: int, arrays: list[Array], name: str) -> None:

@@ -109,9 +109,7 @@ class Log:
                 latest = f"more than {GROUPS} different messages; the latest: {kind}: {message}"
                 other = "other", latest[:200]
                 group = next((g for g in self._groups if g[0] == "other"), other)
-            if group not in self._groups:
-                self._groups[group] = Incident(*group, 0, *example())
-            incident = self._groups[group]
+            incident = self._groups.get(group) or Incident(*group, 0, *example())
             self._groups[group] = incident._replace(count=incident.count + 1)
 
     def all(self):
@@ -206,11 +204,10 @@ def incidents(sim: Simulator) -> tuple[Incident, ...]:
 
 def merge_incidents(first, second):
     """All incidents as one tuple, in which those of one kind and message are counted together."""
-    groups = {(i.kind, i.message): i for i in first}
-    for i in second:
-        group = i.kind, i.message
-        count = groups[group].count if group in groups else 0
-        groups[group] = groups.get(group, i)._replace(count=count + i.count)
+    groups = {}
+    for i in (*first, *second):
+        known = groups.setdefault((i.kind, i.message), i._replace(count=0))
+        groups[i.kind, i.message] = known._replace(count=known.count + i.count)
     return tuple(groups.values())
 
 

@@ -37,14 +37,6 @@ class Rows(NamedTuple):
     """Whether results are to be kept, and so made into bytes."""
 
 
-class Found(NamedTuple):
-    """The rows that are done, from the first on."""
-
-    outcomes: list[Outcome]
-    ended: str = ""
-    """Words of what ended them early, where it was no interruption."""
-
-
 def options_of(
     function: Callable[..., Any], options: Mapping[str, Any], folder: Any, n: int
 ) -> list[Mapping[str, Any]]:
@@ -56,9 +48,9 @@ def options_of(
     return [{**options, "checkpoint": Path(folder) / f"row-{i}"} for i in range(n)]
 
 
-def run_here(rows: Rows, follow: bool, store: Checkpoint | None, watch: Watch) -> Found:
-    """One row after the other in this thread; ``follow``: each is given the result before it.
-    KeyboardInterrupt where one meets the first row.
+def run_here(rows: Rows, follow: bool, store: Checkpoint | None, watch: Watch) -> list[Outcome]:
+    """The rows that are done, from the first on: one after the other in this thread; ``follow``:
+    each is given the result before it. KeyboardInterrupt where one meets the first row.
     """
     found, near = [], {}
     try:
@@ -77,14 +69,15 @@ def run_here(rows: Rows, follow: bool, store: Checkpoint | None, watch: Watch) -
     except KeyboardInterrupt:
         if not found:
             raise
-    return Found(found)
+    return found
 
 
 def run_in_executor(
     rows: Rows, executor: Executor, store: Checkpoint | None, watch: Watch
-) -> Found:
-    """Each row a unit of `runtime.work` in the processes of ``executor``: one whose process dies is
-    tried again twice, and then has an error.
+) -> tuple[list[Outcome], str]:
+    """Likewise, each row a unit of `runtime.work` in the processes of ``executor``: one whose
+    process dies is tried again twice, and then has an error. And words of what ended the rows
+    early, where it was no interruption.
     """
 
     def fold(done, i, outcome):
@@ -95,7 +88,7 @@ def run_in_executor(
     lost = "left out, since its process failed in every attempt"
     found = [ran.state.get(i, (None, RuntimeError(lost))) for i in range(ran.done)]
     cut = next((i for i, (result, _) in enumerate(found, 1) if _ended_early(result)), len(found))
-    return Found(found[:cut], ran.ended or "")
+    return found[:cut], ran.ended or ""
 
 
 def _run_row(

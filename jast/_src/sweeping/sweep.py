@@ -127,7 +127,7 @@ def sweep(
         own = options_of(function, options, None if executor else checkpoint, n)
         rows = Rows(function, keys, made, own, store is not None)
         if executor is None:
-            found, ended = run_here(rows, follow, store, watch)
+            found, ended = run_here(rows, follow, store, watch), ""
         else:
             found, ended = run_in_executor(rows, executor, store, watch)
         curve = _join(function, rows, found)
