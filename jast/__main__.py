@@ -5,6 +5,7 @@ or one search of a built-in system.
 import argparse
 import importlib.util
 import sys
+from functools import partial
 from pathlib import Path
 
 import jax
@@ -28,13 +29,10 @@ from jast.explain import cards
 from jast.stress_testing import stress
 
 STANDARD = rewards.standard(event_bonus=30.0, density="mode")
+OF_FERRY = STANDARD, actions.uniform(0.0, 1.0)
 SYSTEMS = {  # name: the simulator, the reward and the actions of a search
-    "ferry": (simulators.ferry, STANDARD, actions.uniform(0.0, 1.0)),
-    "ferry-b": (
-        lambda: simulators.ferry(adversary=(17.0, 0.0)),
-        STANDARD,
-        actions.uniform(0.0, 1.0),
-    ),
+    "ferry": (simulators.ferry, *OF_FERRY),
+    "ferry-b": (partial(simulators.ferry, adversary=(17.0, 0.0)), *OF_FERRY),
     "walk1d": (simulators.walk1d, STANDARD, actions.uniform(-1.0, 1.0)),
     "colav": (
         simulators.colav,

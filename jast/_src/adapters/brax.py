@@ -30,12 +30,10 @@ class _Environment:
 
 
 def _outcome(state: Any) -> closed_loop.Outcome:
-    done = jnp.asarray(state.done)
+    done = jnp.asarray(state.done).astype(bool)
     # what counts steps says so when the time is over, which is no failure
     late = state.info.get("truncation", 0.0) if isinstance(state.info, dict) else 0.0
-    return closed_loop.Outcome(
-        state, state.obs, state.reward, done.astype(bool) & ~jnp.asarray(late, bool)
-    )
+    return closed_loop.Outcome(state, state.obs, state.reward, done & ~jnp.asarray(late, bool))
 
 
 def brax(

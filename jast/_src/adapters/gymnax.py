@@ -33,9 +33,8 @@ class _Environment:
         step = without_stops(self.env.step_env)
         observation, state, reward, done, _ = step(key, push(state), action, *self._given())
         # of several agents: those of each by its name
-        return closed_loop.Outcome(
-            state, observation, reward, done["__all__"] if type(done) is dict else done
-        )
+        done = done["__all__"] if type(done) is dict else done
+        return closed_loop.Outcome(state, observation, reward, done)
 
     def _given(self) -> tuple[Any, ...]:
         return () if self.subject is None else (self.subject,)

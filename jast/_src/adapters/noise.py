@@ -38,11 +38,8 @@ def random(
         model = D.Joint({k: _as_one_value(d) for k, d in model.items()})
     alone = adds or apply is not None
     if not (D.is_distribution(model) or callable(model)) or not alone:
-        raise ValueError(
-            f"{name}: {place} must be "
-            + ("a distribution, or " if alone else "")
-            + f"{PAIR}, received {value!r}"
-        )
+        expected = f"a distribution, or {PAIR}" if alone else PAIR
+        raise ValueError(f"{name}: {place} must be {expected}, received {value!r}")
     # a distribution of jast is a pytree, whose numbers are traced
     model = model if isinstance(model, D.Distribution) else as_partial(model)
     return Random(model, None if apply is None else as_partial(apply))

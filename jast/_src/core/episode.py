@@ -128,14 +128,10 @@ def _rollout(key: jax.Array, sim: Simulator, policy: Policy | None, reward: Call
     keys = jax.random.split(key, sim.horizon + 1)
     x0 = D.sample(policy.start(), keys[0])
 
-    return play_chosen(
-        sim,
-        reward,
-        x0,
-        lambda state, t, key: D.sample(policy.disturbance(state, t), key),
-        keys[1:],
-        sim.horizon,
-    )
+    def choose(state, t, key):
+        return D.sample(policy.disturbance(state, t), key)
+
+    return play_chosen(sim, reward, x0, choose, keys[1:], sim.horizon)
 
 
 def replay(
@@ -168,11 +164,9 @@ def replay(
         (True, 5)
     """
     require_simulator("replay", sim)
-    length = None
+    disturbances, length = episode, None
     if isinstance(episode, Episode):
         disturbances, x0, length = episode.disturbances, episode.x0, episode.length
-    else:
-        disturbances = episode
     like = signature_of(sim)
     x0 = like.x0 if x0 is None and not like.random_start else x0
     x0 = conform("replay: x0", x0, like.x0)

@@ -391,6 +391,4 @@ def _best(caller, failures, top):
         counts=np.array([failures.counts[group].sum() for group in groups], np.int32),
         tree=failures.tree[first],
         simulation=failures.simulation[first],
-        seen=0,
-        dropped=0,
     )

@@ -72,9 +72,8 @@ class Standard:
     def __call__(
         self, log_p: Any, event: Any, distance: Any, terminal: Any, approach: Any = 0.0
     ) -> Any:
-        return log_p + jnp.where(
-            terminal, jnp.where(event, _like(self.event_bonus, log_p), -distance), 0
-        )
+        bonus = _like(self.event_bonus, log_p)
+        return log_p + jnp.where(terminal, jnp.where(event, bonus, -distance), 0)
 
 
 @jax.tree_util.register_dataclass
@@ -124,11 +123,8 @@ class Shaped:
     def __call__(
         self, log_p: Any, event: Any, distance: Any, terminal: Any, approach: Any = 0.0
     ) -> Any:
-        return (
-            log_p
-            + _like(self.scale, log_p) * approach
-            + jnp.where(event, _like(self.event_bonus, log_p), 0)
-        )
+        scale, bonus = (_like(v, log_p) for v in (self.scale, self.event_bonus))
+        return log_p + scale * approach + jnp.where(event, bonus, 0)
 
 
 @jax.tree_util.register_dataclass
@@ -307,10 +303,10 @@ def lexicographic(
     for name, value in (("near", near), ("rare", rare)):
         if value is not None and not is_traced(value) and not value > 0:
             raise ValueError(f"rewards.lexicographic: {name} must be above 0, received {value!r}")
-    if density is None:
-        density = "mode" if near is not None and rare is not None else None
-    else:
+    if density is not None:
         _checked("lexicographic", density)
+    elif near is not None and rare is not None:
+        density = "mode"
     return Lexicographic(near, rare, likely, density)
 
 
