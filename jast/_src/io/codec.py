@@ -5,7 +5,6 @@ The JSON holds what is a number, a text, True, False or None as it is; everythin
 of one key that says what it is. Arrays are named, and stand beside it.
 """
 
-import dataclasses
 import importlib
 import pkgutil
 from typing import Any, NamedTuple
@@ -16,6 +15,7 @@ import numpy as np
 
 from jast._src.io import former_files
 from jast._src.runtime._jax import is_traced
+from jast._src.util.pytrees import fields_of
 
 __all__ = ["Given", "check_episodes", "check_fits", "decode", "encode", "name_of", "place_of"]
 
@@ -244,9 +244,7 @@ def _array(value: Any, arrays: dict[str, np.ndarray], at: str) -> dict[str, str]
 def _fields(name: str, value: Any) -> dict[str, Any]:
     if name in WITH_FUNCTIONS:
         return importlib.import_module(WITH_FUNCTIONS[name]).parts(value)
-    if isinstance(value, tuple):
-        return value._asdict()
-    return {f.name: getattr(value, f.name) for f in dataclasses.fields(value)}
+    return fields_of(value)
 
 
 def _record(path: Any, name: str, fields: dict[str, Any], given: Given) -> Any:

@@ -14,6 +14,8 @@ from typing import Any
 import jax
 import numpy as np
 
+from jast._src.util.pytrees import fields_of
+
 __all__ = ["describe_differences", "fingerprint", "versions"]
 
 NAMED = 3  # differences that a message names: more would hide the first
@@ -85,7 +87,7 @@ def _describe(name: str, value: Any, above: tuple) -> Iterator[tuple[str, str]]:
         yield from inside(enumerate(value))
     elif dataclasses.is_dataclass(value) and not isinstance(value, type):
         yield name, type(value).__qualname__
-        yield from inside((f.name, getattr(value, f.name)) for f in dataclasses.fields(value))
+        yield from inside(fields_of(value).items())
     elif inspect.isroutine(function := inspect.unwrap(value) if callable(value) else value):
         yield from _of_function(name, function, above)
     else:

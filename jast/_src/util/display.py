@@ -8,7 +8,6 @@ that means nothing there is None.
 import html
 import warnings
 from collections.abc import Callable, Mapping
-from dataclasses import fields as dataclass_fields
 from dataclasses import is_dataclass
 from textwrap import shorten
 from typing import Any, TypeVar
@@ -18,6 +17,7 @@ import numpy as np
 from jax.tree_util import Partial
 
 from jast._src.runtime._jax import is_traced
+from jast._src.util.pytrees import fields_of
 
 __all__ = [
     "VOCABULARY",
@@ -158,17 +158,10 @@ def _number(value: Any) -> bool:
     return isinstance(value, int | float | np.ndarray | np.generic | jax.Array)
 
 
-def _fields(value: Any) -> dict[str, Any]:
-    """The fields of a NamedTuple or of a dataclass."""
-    if is_dataclass(value):
-        return {f.name: getattr(value, f.name) for f in dataclass_fields(value)}
-    return value._asdict()
-
-
 def _by_fields(value: Any, note: str = "") -> str:
     """ "Name(field=..., ...)", wrapped, each field in few words."""
     name = type(value).__name__
-    parts = [f"{field}={_words(v)}" for field, v in _fields(value).items()]
+    parts = [f"{field}={_words(v)}" for field, v in fields_of(value).items()]
     head = f"{name} ({note}): " if note else f"{name}("
     lines = [head]
     for i, part in enumerate(parts):
@@ -226,7 +219,7 @@ def _is_record(value: Any) -> bool:
 
 def _html(self: Any) -> str:
     """A table of the fields; the names of `VOCABULARY` that are no fields of it come after them."""
-    rows = dict(_fields(self))
+    rows = fields_of(self)
     for name in VOCABULARY:
         if name in rows or isinstance(getattr(type(self), name, None), Former):
             continue

@@ -44,8 +44,7 @@ def clopper_pearson(k: int, n: int, level: float = 0.95) -> tuple[float, float]:
         >>> low, round(high, 6)
         (0.0, 0.003682)
     """
-    _check_counts("clopper_pearson", k, n, level)
-    return _exact_interval(int(k), int(n), level)
+    return _exact_interval(*_checked_counts("clopper_pearson", k, n, level), level)
 
 
 def effective_interval(
@@ -95,12 +94,14 @@ def checked_level(function: str, level: float) -> float:
     return number(function, "level", level, lambda v: 0 < v < 1, "between 0 and 1")
 
 
-def _check_counts(function, k, n, level):
+def _checked_counts(function, k, n, level):
+    """``k`` and ``n`` as whole numbers."""
     if not (n == int(n) and n >= 1):
         raise ValueError(f"{function}: n must be a whole number of at least 1, received {n!r}")
     if not (k == int(k) and 0 <= k <= n):
         raise ValueError(f"{function}: k must be a whole number from 0 to n = {n}, received {k!r}")
     checked_level(function, level)
+    return int(k), int(n)
 
 
 def chernoff(k: int, n: int, level: float = 0.95) -> float:
@@ -125,8 +126,7 @@ def chernoff(k: int, n: int, level: float = 0.95) -> float:
     """
     from scipy.optimize import brentq  # here: slow to import
 
-    _check_counts("chernoff", k, n, level)
-    k, n = int(k), int(n)
+    k, n = _checked_counts("chernoff", k, n, level)
     if k == n:
         return 1.0
     share, bound = k / n, -math.log1p(-level) / n
@@ -158,8 +158,8 @@ def delta_bound(k: int, n: int, level: float = 0.95) -> float:
         >>> round(delta_bound(0, 1000), 4)
         0.0547
     """
-    _check_counts("delta_bound", k, n, level)
-    return min(1.0, int(k) / int(n) + math.sqrt(-math.log1p(-level) / int(n)))
+    k, n = _checked_counts("delta_bound", k, n, level)
+    return min(1.0, k / n + math.sqrt(-math.log1p(-level) / n))
 
 
 def normal(mean: float, standard_error: float, level: float = 0.95) -> tuple[float, float]:
@@ -209,8 +209,8 @@ def jeffreys(k: int, n: int, level: float = 0.95) -> float:
     """
     from scipy.special import betaincinv  # here: slow to import
 
-    _check_counts("jeffreys", k, n, level)
-    return float(betaincinv(int(k) + 0.5, int(n) - int(k) + 0.5, level))
+    k, n = _checked_counts("jeffreys", k, n, level)
+    return float(betaincinv(k + 0.5, n - k + 0.5, level))
 
 
 def log_normal(

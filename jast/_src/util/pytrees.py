@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any, NamedTuple
 
 import jax
@@ -17,6 +17,7 @@ __all__ = [
     "zero_where",
     "count_numbers",
     "conform",
+    "fields_of",
     "map_in_lanes",
     "pad_rows",
     "select",
@@ -113,6 +114,13 @@ def map_in_lanes(size: int, function: Callable, *trees: Any) -> Any:
         function(*jax.tree.map(lambda a, rows=rows: np.asarray(a)[rows], trees)) for rows in parts
     ]
     return jax.tree.map(lambda *a: np.concatenate(a)[:n], *jax.device_get(found))
+
+
+def fields_of(record: Any) -> dict[str, Any]:
+    """The fields of a NamedTuple or of a dataclass."""
+    if isinstance(record, tuple):
+        return record._asdict()
+    return {f.name: getattr(record, f.name) for f in fields(record)}
 
 
 def count_numbers(like: Any) -> int:
