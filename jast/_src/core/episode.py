@@ -201,17 +201,14 @@ def play_chosen(
     """The episode of at most ``steps`` steps in which ``choose(state, t, rows[t])`` gives the
     disturbances.
     """
-    first, hosted = begin(sim, reward, x0, last=steps <= 0), runs_on_host(sim)
+    first = begin(sim, reward, x0, last=steps <= 0)
+    # an ended lane goes on from the start state, so that no NaN reaches a gradient; of a state of
+    # zeros no black box is asked
+    rest = jax.tree.map(jnp.zeros_like, first.state) if runs_on_host(sim) else first.state
 
     def body(before, at):
         t, row = at
-        # an ended lane goes on from the start state, so that no NaN reaches a gradient; of a state
-        # of zeros no black box is asked
-        if hosted:
-            state = zero_where(before.done, before.state)
-        else:
-            state = select(before.done, first.state, before.state)
-        safe = before._replace(state=state)
+        safe = before._replace(state=select(before.done, rest, before.state))
         x = choose(safe.state, t, row)
         after = advance(sim, reward, safe, x, t + 1 >= steps)
         kept = select(before.done, before, after)

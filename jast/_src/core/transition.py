@@ -15,7 +15,7 @@ from jast._src.core import rewards
 from jast._src.core.signature import signature_of
 from jast._src.core.simulator import Simulator
 from jast._src.core.typing import ArrayTree
-from jast._src.util.pytrees import with_strong_types
+from jast._src.util.pytrees import with_strong_types, zero_where
 
 __all__ = ["Progress", "advance", "begin", "blank", "conclude"]
 
@@ -106,9 +106,7 @@ def conclude(sim: Simulator, reward: Callable, progress: Progress, live: Any = T
     if not sim.episodic:
         return progress
     live = jnp.asarray(live) & progress.done & ~progress.invalid
-    event, own, *told = sim.evaluate(
-        jax.tree.map(lambda a: jnp.where(live, a, jnp.zeros((), a.dtype)), progress.state)
-    )
+    event, own, *told = sim.evaluate(zero_where(~live, progress.state))
     event, own = jnp.asarray(event), jnp.asarray(own).astype(progress.reward.dtype)
     told = sum(jnp.asarray(p).astype(own.dtype) for p in told)
     owed, log_prob = progress.owed + told, progress.log_prob + told
