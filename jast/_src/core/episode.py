@@ -176,11 +176,8 @@ def replay(
             f"replay: disturbances must have between 0 and {sim.horizon} rows (the horizon),"
             f" received {jax.tree.map(jnp.shape, disturbances)}"
         )
-    disturbances = conform(
-        "replay: disturbances",
-        disturbances,
-        jax.tree.map(lambda s: jax.ShapeDtypeStruct((steps, *s.shape), s.dtype), like.x),
-    )
+    rows = jax.tree.map(lambda s: jax.ShapeDtypeStruct((steps, *s.shape), s.dtype), like.x)
+    disturbances = conform("replay: disturbances", disturbances, rows)
     steps = jnp.asarray(steps if length is None else length, jnp.int32)
     return play_back(sim, rewards.as_pytree(reward), x0, pad_rows(disturbances, sim.horizon), steps)
 
@@ -212,11 +209,7 @@ def play_chosen(
         x = choose(safe.state, t, row)
         after = advance(sim, reward, safe, x, t + 1 >= steps)
         kept = select(before.done, before, after)
-        return kept, (
-            zero_where(before.done, x),
-            zero_where(before.done, after.state),
-            ~before.done,
-        )
+        return kept, (*zero_where(before.done, (x, after.state)), ~before.done)
 
     last, (disturbances, states, live) = lax.scan(
         body, first, (jnp.arange(sim.horizon, dtype=jnp.int32), rows)

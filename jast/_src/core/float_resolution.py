@@ -23,7 +23,7 @@ from jast._src.core.simulator import Simulator
 from jast._src.core.typing import Array
 from jast._src.runtime._jax import quick
 from jast._src.runtime.host_errors import runs_on_host
-from jast._src.util.pytrees import with_strong_types
+from jast._src.util.pytrees import select, with_strong_types
 
 __all__ = ["Probe", "describe", "probe", "rounding_problem"]
 
@@ -106,9 +106,8 @@ def _probe(sim):
     key = jax.random.key(0, impl=COUNTER)
     shape = STARTS, steps + 2, *jax.random.key_data(key).shape
     keys = jax.random.bits(key, shape, jnp.uint32)
-    units, distance, unmoved, differ, back, starts = jax.vmap(partial(_five_paths, sim, steps))(
-        keys
-    )
+    paths = jax.vmap(partial(_five_paths, sim, steps))(keys)
+    units, distance, unmoved, differ, back, starts = paths
     units = [jnp.nanmedian(jnp.where(u > 0, u, jnp.nan), axis=0) for u in units]
     gap = distance[:, 2] - distance[:, 0]
     gap = jnp.where(jnp.isfinite(gap), gap, 0)
@@ -182,11 +181,9 @@ def _five_paths(sim: Simulator, steps: int, keys: jax.Array) -> tuple[Any, ...]:
         dist = sim.disturbance(state)
         wide = Wide(jnp.where(i == 4, WIDTH, 1.0))
         x = wide.draw(key, dist) if widens else D.sample(dist, key)
-        after = jax.tree.map(
-            lambda a: jnp.where(i == 2, _a_unit_off(seed + t.astype(seed.dtype), a), a),
-            sim.step(state, x),
-        )
-        return after, x
+        after = sim.step(state, x)
+        off = jax.tree.map(partial(_a_unit_off, seed + t.astype(seed.dtype)), after)
+        return select(i == 2, off, after), x
 
     def evaluate(state):
         event, distance, *_ = sim.evaluate(state)
@@ -290,9 +287,8 @@ def _a_unit_off(seed: jax.Array, a: jax.Array) -> jax.Array:
     a = jnp.asarray(a)
     if not jnp.issubdtype(a.dtype, jnp.floating):
         return a
-    h = (jnp.arange(a.size, dtype=jnp.uint32).reshape(a.shape) * 40503 + seed) * jnp.uint32(
-        2654435761
-    )
+    h = jnp.arange(a.size, dtype=jnp.uint32).reshape(a.shape) * 40503 + seed
+    h = h * jnp.uint32(2654435761)
     h = (h ^ (h >> 15)) * jnp.uint32(2246822519)
     up = (h ^ (h >> 13)) * jnp.uint32(3266489917) >> 31 == 1
     return jnp.nextafter(a, jnp.where(up, jnp.inf, -jnp.inf).astype(a.dtype))

@@ -258,17 +258,12 @@ def _add(seen: Seen, number: int, counts: Counts) -> Seen:
             # a running mean: a running sum would lose digits in float32
             step = (total - mean.dtype.type(count) * mean) / mean.dtype.type(valid)
             mean = mean + step
-    failures, invalid = int(counts.failures.sum()), int(counts.invalid.sum())
-    first = seen.first
-    if first is None and failures:
-        first = int(counts.first[counts.failures > 0].min())
-    return Seen(
-        valid + seen.invalid + invalid,
-        seen.failures + failures,
-        seen.invalid + invalid,
-        mean,
-        first,
-    )
+    failures = seen.failures + int(counts.failures.sum())
+    invalid = seen.invalid + int(counts.invalid.sum())
+    first, failing = seen.first, counts.failures > 0
+    if first is None and failing.any():
+        first = int(counts.first[failing].min())
+    return Seen(valid + invalid, failures, invalid, mean, first)
 
 
 def _counts(key, sim, episodes, begin, end):

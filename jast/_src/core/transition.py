@@ -15,7 +15,7 @@ from jast._src.core import rewards
 from jast._src.core.signature import signature_of
 from jast._src.core.simulator import Simulator
 from jast._src.core.typing import ArrayTree
-from jast._src.util.pytrees import with_strong_types, zero_where
+from jast._src.util.pytrees import select, with_strong_types, zero_where
 
 __all__ = ["Progress", "advance", "begin", "blank", "conclude"]
 
@@ -112,12 +112,9 @@ def conclude(sim: Simulator, reward: Callable, progress: Progress, live: Any = T
     owed, log_prob = progress.owed + told, progress.log_prob + told
     total = _pay(reward, progress.reward, owed, event, own, jnp.ones((), bool), -own)
     invalid = ~jnp.isfinite(own) | _wrong(log_prob) | _wrong(total)
-    new = dict(owed=jnp.zeros_like(progress.owed), log_prob=log_prob) | _outcome(
-        total, own, event, jnp.ones((), bool), invalid
-    )
-    return progress._replace(
-        **{name: jnp.where(live, value, getattr(progress, name)) for name, value in new.items()}
-    )
+    outcome = _outcome(total, own, event, jnp.ones((), bool), invalid)
+    new = dict(owed=jnp.zeros_like(progress.owed), log_prob=log_prob) | outcome
+    return progress._replace(**select(live, new, {name: getattr(progress, name) for name in new}))
 
 
 def _arrive(
