@@ -138,6 +138,5 @@ def gymnax(
                 f"gymnax: horizon must be below {place}.{name}, which is {limit}: there step_env"
                 f" says that it has terminated; received {horizon}"
             )
-    return closed_loop.simulator(
-        "gymnax", _Environment(given.pop("env"), given.pop("params")), **given
-    )
+    system = _Environment(given.pop("env"), given.pop("params"))
+    return closed_loop.simulator("gymnax", system, **given)

@@ -214,10 +214,8 @@ class Host:
         self.count(episodes=reply.episodes, transitions=reply.transitions)
 
         def example(i):
-            return (
-                fill(self.spec.x0, [a[i] for a in x0]),
-                fill(self.x, [a[i, : t[i]] for a in xs]),
-            )
+            start = fill(self.spec.x0, [a[i] for a in x0])
+            return start, fill(self.x, [a[i, : t[i]] for a in xs])
 
         problems = _problems(reply, dtype)
         for i, (kind, message) in sorted(problems.items()):

@@ -85,9 +85,8 @@ class Worker:
     def start(self):
         """A future that is done when the process has the system."""
         if self.executor is None:
-            self.executor = import_library(NEEDS, "loky", "blackbox").ProcessPoolExecutor(
-                max_workers=1, timeout=None
-            )
+            loky = import_library(NEEDS, "loky", "blackbox")
+            self.executor = loky.ProcessPoolExecutor(max_workers=1, timeout=None)
             return self.executor.submit(pickle.loads, self.payload)
 
     def kill(self):
@@ -250,11 +249,8 @@ def _merge(all, rows, part):
     for name in ("event", "distance", "terminal", "log_p", "seen"):
         getattr(all, name)[rows] = getattr(part, name)
     all.problems.extend((int(rows[i]), kind, message) for i, kind, message in part.problems)
-    return all._replace(
-        episodes=all.episodes + part.episodes,
-        transitions=all.transitions + part.transitions,
-        seconds=all.seconds + part.seconds,
-    )
+    counts = "episodes", "transitions", "seconds"
+    return all._replace(**{name: getattr(all, name) + getattr(part, name) for name in counts})
 
 
 def _cause(error):

@@ -313,9 +313,8 @@ def quantiles(proposal: DistributionLike | None = None) -> Quantiles:
         >>> chosen.draw(jax.random.key(0), D.Normal(0.0, 1.0)).shape
         ()
     """
-    if proposal is not None and not (
-        isinstance(proposal, D.Distribution) and D.has_quantile(proposal)
-    ):
+    serves = isinstance(proposal, D.Distribution) and D.has_quantile(proposal)
+    if not (proposal is None or serves):
         expected = "proposal must be a distribution with a quantile function"
         raise ValueError(f"actions.quantiles: {expected}, received {proposal!r}"[:200])
     # a distribution itself cannot be mapped over, as searches do with what they are given

@@ -38,8 +38,6 @@ __all__ = [
     "to_numpy",
 ]
 
-ROWS = ("counts", "tree", "simulation")
-
 
 @display.printable("seen")
 @jax.tree_util.register_dataclass
@@ -118,7 +116,7 @@ class Failures:
         columns = [("failure", np.arange(1, len(self) + 1))]
         for name in ("reward", "log_prob", "distance", "length"):
             columns.append((name, getattr(self.episodes, name)))
-        columns += [(name, getattr(self, name)) for name in ROWS]
+        columns += [(name, getattr(self, name)) for name in ("counts", "tree", "simulation")]
         return dataframe(columns, ["failure"])
 
     @property
@@ -363,10 +361,10 @@ def _numbers(name, values, m):
 
 def identity(episode):
     """What makes two failures one: the bytes of x0 and of the disturbances that were used."""
-    leaves = jax.tree.leaves(episode.x0) + [
-        a[: int(episode.length)] for a in jax.tree.leaves(episode.disturbances)
-    ]
-    return int(episode.length), *(np.ascontiguousarray(a).tobytes() for a in leaves)
+    length = int(episode.length)
+    used = [a[:length] for a in jax.tree.leaves(episode.disturbances)]
+    leaves = [*jax.tree.leaves(episode.x0), *used]
+    return length, *(np.ascontiguousarray(a).tobytes() for a in leaves)
 
 
 def _best(caller, failures, top):

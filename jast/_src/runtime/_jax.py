@@ -212,11 +212,8 @@ def _batched(args, axes, *, callback, shapes):
 
 
 # an argument of JAX 0.8.2 and later; of effect on a TPU only
-_NO_TOKEN = (
-    {"returns_token": False}
-    if "returns_token" in inspect.signature(mlir.emit_python_callback).parameters
-    else {}
-)
+_KNOWN = inspect.signature(mlir.emit_python_callback).parameters
+_NO_TOKEN = {"returns_token": False} if "returns_token" in _KNOWN else {}
 
 
 def _lowered(ctx, *args, callback, shapes):
@@ -226,16 +223,8 @@ def _lowered(ctx, *args, callback, shapes):
         return mlir.lower_fun(
             lambda *a: jax.pure_callback(callback, structs, *a), multiple_results=True
         )(ctx, *args)
-    out, _, _ = mlir.emit_python_callback(
-        ctx,
-        callback,
-        None,
-        list(args),
-        ctx.avals_in,
-        ctx.avals_out,
-        has_side_effect=False,
-        **_NO_TOKEN,
-    )
+    given = ctx, callback, None, list(args), ctx.avals_in, ctx.avals_out
+    out, _, _ = mlir.emit_python_callback(*given, has_side_effect=False, **_NO_TOKEN)
     return out
 
 

@@ -63,11 +63,8 @@ def real_number(function, name, value, holds, expected):
     """
     if not is_traced(value):
         try:
-            good = (
-                not isinstance(value, str | bool)
-                and np.shape(value) == ()
-                and bool(holds(float(value)))
-            )
+            one = not isinstance(value, str | bool) and np.shape(value) == ()
+            good = one and bool(holds(float(value)))
         except (TypeError, ValueError):
             good = False
         if not good:
