@@ -526,6 +526,15 @@ def test_fixed_and_deterministic(key):
     assert D.log_density(d, D.mode(d), "mode") == 0
 
 
+@pytest.mark.parametrize("shape", [(), (4,), (2, 3)])
+def test_what_is_recorded_may_stand_beside_what_is_drawn(key, shape):
+    recorded = D.Deterministic(jnp.arange(3.0))
+    both = D.Joint({"recorded": recorded, "drawn": D.Normal(0.0, 1.0)})
+    x = both.sample(seed=key, sample_shape=shape)
+    assert x["drawn"].shape == shape and x["recorded"].shape == (*shape, 3)
+    np.testing.assert_array_equal(x["recorded"], np.broadcast_to(np.arange(3.0), (*shape, 3)))
+
+
 # densities
 
 

@@ -73,10 +73,12 @@ class Deterministic(_WithoutDensity):
     def sample(
         self, *, seed: PRNGKey | int | None = None, sample_shape: int | Sequence[int] = ()
     ) -> Any:
-        return self._value
+        if sample_shape == ():
+            return self._value
+        return super().sample(seed=seed, sample_shape=sample_shape)
 
     def _sample_n(self, key: PRNGKey, n: int) -> Any:
-        return jax.tree.map(lambda a: jnp.broadcast_to(a, (n, *a.shape)), self._value)
+        return jax.tree.map(lambda a: jnp.broadcast_to(a, (n, *jnp.shape(a))), self._value)
 
     def mode(self) -> Any:
         return self._value
