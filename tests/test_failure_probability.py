@@ -355,8 +355,8 @@ def test_no_quantile_function(key, method):
     "make, match",
     [
         (
-            lambda key: failure_probability(key, planes(), 49),
-            "failure_probability: budget must .*received 49",
+            lambda key: failure_probability(key, planes(), 39),
+            "failure_probability: budget must .*received 39",
         ),
         (
             lambda key: failure_probability(key, planes(), level=1.0),

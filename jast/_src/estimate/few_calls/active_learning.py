@@ -101,8 +101,8 @@ class Learner:
         if not with_warp and self.surrogate is not None:
             self.surrogate = fit(*data, self.surrogate, self.surrogate.warp, rounds=1)
             return
-        seen = np.abs(self.distance[rows][~hidden])
-        middle = float(np.median(seen)) if len(seen) else 0.0
+        safe = self.distance[rows][~self.failing[rows]]
+        middle = float(np.median(safe)) if len(safe) else 0.0
         warps = [math.inf, *(middle * w for w in WARPS if middle > 0)]
         tried = [fit(*data, self.surrogate, warp) for warp in warps]
         self.surrogate = max(tried, key=lambda surrogate: surrogate.evidence)
