@@ -20,6 +20,10 @@ from jast._src.runtime.host_errors import Log
 
 __all__ = ["Calls", "Host"]
 
+KEPT_SECONDS = 0.1
+"""Seconds of runs after which a checkpoint has them: so much a kill loses, or one run; of several
+workers four runs each, so that none waits long for another."""
+
 
 class Calls(NamedTuple):
     """What a black box has done so far. Python numbers.
@@ -70,6 +74,7 @@ class Host:
         self.store: Callable[[list], None] | None = None  # of a checkpoint
         self.told: Callable[[int], None] | None = None
         self.differs = False  # the system answered the same history in two ways
+        self.pace = np.inf  # seconds a run, of the last ones
         self.lock = threading.Lock()
         # one callable for each kind of answer, as it is part of what a compiled program is known by
         self.callback = cache(lambda dtype, size: partial(self, dtype, size))
@@ -174,9 +179,12 @@ class Host:
         """
         keys = keys_of(x0, xs, t)
         known = [self.answers.get(key) for key in keys]
-        rows = self._to_run(keys, known, t)
-        answers = self._run(keys, rows, lanes, t, x0, xs, dtype) if len(rows) else {}
+        rows, answers = self._to_run(keys, known, t), {}
         self.count(rows=len(t), known=len(t) - len(rows))
+        while len(rows):
+            n = len(rows) if self.store is None else self._kept_at_once()
+            answers |= self._run(keys, rows[:n], lanes, t, x0, xs, dtype)
+            rows = rows[n:]
         found = [answers.get(i) or answers.get(keys[i]) or a for i, a in enumerate(known)]
         event, distance, terminal, log_p, seen = zip(*found, strict=True)
         event, terminal = np.array(event, bool), np.array(terminal, bool)
@@ -200,6 +208,12 @@ class Host:
                 twice.append(i)
         return np.array(sorted([*first.values(), *twice]), int)
 
+    def _kept_at_once(self):
+        """After how many runs a checkpoint has them."""
+        workers = self.workers()
+        least = 1 if workers == 1 else 4 * workers
+        return max(least, int(workers * KEPT_SECONDS / self.pace))
+
     def _in_doubt(self, before, t):
         """Whether a row with this answer is run once more, to see whether it is answered the same:
         the first failure that is asked for again is, and the first other one.
@@ -211,6 +225,7 @@ class Host:
         t, lanes = t[rows], lanes[rows]
         x0, xs = [a[rows] for a in x0], [a[rows] for a in xs]
         reply = self.runner(t, x0, xs, lanes)
+        self.pace = max(reply.seconds / len(t), 1e-9)
         self.count(episodes=reply.episodes, transitions=reply.transitions)
 
         def example(i):
