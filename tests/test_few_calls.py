@@ -2,6 +2,8 @@
 model, and the estimate of slow systems.
 """
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -73,9 +75,36 @@ def test_a_warp_is_odd_about_the_boundary():
     np.testing.assert_allclose(here.evidence, there.evidence, rtol=1e-6)
 
 
-def test_what_every_failure_says_alike_is_no_depth():
-    depths = active_learning._depths(np.array([0.5, -1.0, -0.2, -1.0, 0.0, 0.0, 0.5]))
-    assert depths.tolist() == [False, False, True, False, False, False, False]
+@pytest.mark.parametrize(
+    "distance, depths",
+    [
+        ([0.5, -1.0, -0.2, -1.0, -0.3, 0.0, 0.0, 0.5], [2, 4]),
+        ([0.5, -1.0, 0.7, 0.0], []),  # may be what every failure says
+        ([0.5, -0.1, -0.1, -0.4], [1, 2, 3]),  # a point that was drawn twice
+    ],
+)
+def test_what_every_failure_says_alike_is_no_depth(distance, depths):
+    z = np.arange(len(distance))[:, None]
+    if len(depths) == 3:
+        z[2] = z[1]
+    found = active_learning._depths(z, np.array(distance))
+    assert np.flatnonzero(found).tolist() == depths
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(2))
+def test_a_constant_of_every_failure_is_as_good_as_none(seed, coarse):
+    """-1 for each failure, or 0: the same answer."""
+
+    def curved(x):
+        return 3.8 - x[0] + 0.1 * x[1] ** 2
+
+    def judged(constant):
+        evaluate = lambda x: (curved(x) <= 0, jnp.where(curved(x) <= 0, constant, curved(x)))
+        return dataclasses.replace(limit_state(curved, 2), evaluate=evaluate)
+
+    found = [failure_probability(jax.random.key(seed), judged(c), 60) for c in (-1.0, 0.0)]
+    assert found[0].mean == found[1].mean and found[0].interval == found[1].interval
 
 
 @pytest.mark.slow

@@ -98,7 +98,7 @@ def subset_simulation(
         shared = jax.random.split(key, replicates), sim, samples
         task = Task(_run_replicate, shared, lambda: Explored(*Explored._fields))
         placement = placement._replace(store=store)
-        ran = work.run(task, replicates, lambda all, i, run: (*all, run), (), watch, placement)
+        ran = work.run(task, replicates, lambda runs, i, run: (*runs, run), (), watch, placement)
     runs = ran.state
     short = work.describe_missing("populations", ran, len(runs), replicates)
     if len(runs) < MIN_REPLICATES:

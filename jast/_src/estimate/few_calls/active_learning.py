@@ -1,9 +1,10 @@
 """A surrogate of a slow system learns where a call says most.
 
-As AK-MCS (Echard, Gayton and Lemaire 2011) with other parts: failures are data without a value
-(`estimate.few_calls.surrogate`), candidates are drawn around what the surrogate holds for possible
-(`estimate.few_calls.surrogate_pool`), and a batch is chosen that leaves the least doubt about
-failure at these. A quarter of each batch looks where nobody has looked.
+As AK-MCS (Echard, Gayton and Lemaire 2011) with other parts: failures are data without a value,
+unless they say how deep they are (`estimate.few_calls.surrogate`), candidates are drawn around what
+the surrogate holds for possible (`estimate.few_calls.surrogate_pool`), and a batch is chosen that
+leaves the least doubt about failure at these. A quarter of each batch looks where nobody has
+looked.
 """
 
 import math
@@ -14,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jast._src.core.counter_prng import numpy_generator
+from jast._src.core.signature import signature_of
 from jast._src.core.simulator import Simulator
 from jast._src.estimate.few_calls.surrogate import (
     Surrogate,
@@ -61,8 +63,9 @@ class Learner:
         self.dtype, self.dimension = transform.normal_numbers(sim), transform.dimension(sim)
         self.z, self.distance = np.zeros((0, self.dimension)), np.zeros(0)
         self.failing, self.invalid = np.zeros(0, bool), np.zeros(0, bool)
-        # a longer episode ends where it fails, however deep it would have got
-        self.shows_depth = sim.episodic or sim.horizon == 1
+        # an episode that is judged on the way ends where it fails, however deep it would have got
+        one_state = sim.horizon == 1 and not signature_of(sim).random_start
+        self.shows_depth = sim.episodic or one_state
         self.steps, self.spent = 0, 0
         self.plain = (0, 0, 0)  # (failing, invalid, calls) of draws of the model
         self.surrogate: Surrogate | None = None
@@ -96,7 +99,7 @@ class Learner:
     def fit(self, with_warp: bool) -> None:
         """Fit the surrogate to what was seen; ``with_warp``: with the choice of its warp."""
         rows = np.flatnonzero(~self.invalid)[:HELD]
-        hidden = self.failing[rows] & ~_depths(self.distance[rows])
+        hidden = self.failing[rows] & ~_depths(self.z[rows], self.distance[rows])
         data = self.z[rows], self.distance[rows], hidden
         if not with_warp and self.surrogate is not None:
             self.surrogate = fit(*data, self.surrogate, self.surrogate.warp, rounds=1)
@@ -137,12 +140,14 @@ def choose_calls(learner: Learner) -> None:
     )
 
 
-def _depths(distance):
-    """Which of these [n] say how deep an episode failed: below 0, and not what others say, too, as
-    a -1 that stands for every failure.
+def _depths(z, distance):
+    """Which of the ``distance`` [n] of points ``z`` [n, D] say how deep an episode failed: below 0,
+    and not what others say, too, as a -1 that stands for every failure. One alone may be such a -1.
     """
-    _, which, count = np.unique(distance, return_inverse=True, return_counts=True)
-    return (distance < 0) & (count[which] == 1)
+    _, once = np.unique(z, axis=0, return_index=True)  # a point may have been drawn twice
+    values, times = np.unique(distance[once], return_counts=True)
+    depths = values[(values < 0) & (times == 1)]
+    return np.isin(distance, depths if len(depths) > 1 else [])
 
 
 def _unseen(learner, n):

@@ -1,11 +1,11 @@
-"""A Gaussian process on a limit state of which only the safe side is seen: the miss distance where
-an episode is safe, and that it is below 0 where one fails.
+"""A Gaussian process on a limit state of which mostly the safe side is seen: the miss distance of
+safe episodes; of a failure how far below 0 it is, or only that it is below.
 
-On the host, in double precision. Distances are observed values, failures are half-lines; Gaussian
-sites stand for these by expectation propagation (Minka 2001; Rasmussen and Williams 2006, Gaussian
-processes for machine learning, ch. 3.6), so that predictions are those of a regression. The
-covariance has a constant and a linear part, and Matern 5/2 with a lengthscale for each coordinate;
-hyperparameters climb the likelihood with the sites held.
+On the host, in double precision. Distances are observed values, failures without a depth (hidden
+ones) are half-lines; Gaussian sites stand for these by expectation propagation (Minka 2001;
+Rasmussen and Williams 2006, Gaussian processes for machine learning, ch. 3.6), so that predictions
+are those of a regression. The covariance has a constant and a linear part, and Matern 5/2 with a
+lengthscale for each coordinate; hyperparameters climb the likelihood with the sites held.
 """
 
 import math
@@ -25,7 +25,7 @@ SWEEPS = 12  # of expectation propagation, at most
 DAMPING = 0.8  # part of the way to its new value that a site goes: moved at once, they overshoot
 CONVERGED = 0.01  # change of all means, in standard deviations, that ends the sweeps
 PRECISIONS = 1e-8, 1e8  # of sites: beyond these, matrices are singular in double precision
-UNSEEN_PRECISION = 1e-6  # of the first site of a failure: nothing is known of its value
+UNSEEN_PRECISION = 1e-6  # of the first site of a hidden failure: nothing is known of its value
 JITTER = 1e-8  # part of the mean variance, added to a diagonal against rounding
 LEAST_VARIANCE = 1e-12  # a smaller difference of variances is rounding
 BLOCK = 500  # points of a prediction at a time, whose covariances fit a cache
@@ -58,8 +58,8 @@ def _prior(dimension):
 
 
 class Surrogate(NamedTuple):
-    """A fitted process, of distances that are warped, t = warp log(1 + y / warp), and scaled. On
-    the host.
+    """A fitted process, of distances y that are warped, t = sign(y) warp log(1 + |y| / warp), and
+    scaled. On the host.
     """
 
     z: np.ndarray
@@ -99,8 +99,8 @@ def fit(
     warp: float = math.inf,
     rounds: int = ROUNDS,
 ) -> Surrogate:
-    """The `Surrogate` of points ``z`` [n, D] with ``distance`` [n] where not ``hidden`` [n];
-    ``before``: one of the first of them, to start from.
+    """The `Surrogate` of points ``z`` [n, D] with ``distance`` [n] where not ``hidden`` [n], which
+    failed without saying how deep; ``before``: one of the first of them, to start from.
     """
     seen = ~hidden
     size = np.abs(distance)
@@ -167,61 +167,61 @@ def _with_noise(k, noise):
     return out
 
 
-def _cavities(k, tau, nu, failing):
-    """Means and variances of the failing points without their own sites."""
-    f = np.flatnonzero(failing)
+def _cavities(k, tau, nu, hidden):
+    """Means and variances of the hidden points without their own sites."""
+    f = np.flatnonzero(hidden)
     gain = k[f] @ np.linalg.inv(_with_noise(k, 1 / tau))
     variance = np.maximum(k[f, f] - (gain * k[f]).sum(axis=1), LEAST_VARIANCE)
     v = 1 / np.maximum(1 / variance - tau[f], PRECISIONS[0])
     return v * (gain @ (nu / tau) / variance - nu[f]), v
 
 
-def _fit_sites(k, tau, nu, failing, noise):
-    """Precisions and precision-weighted means [n], those of the failures by expectation
+def _fit_sites(k, tau, nu, hidden, noise):
+    """Precisions and precision-weighted means [n], those of hidden ones by expectation
     propagation, all at once and damped.
     """
-    if not failing.any():
+    if not hidden.any():
         return tau, nu
     tau, nu, last = tau.copy(), nu.copy(), np.inf
     for _ in range(SWEEPS):
-        m, v = _cavities(k, tau, nu, failing)
+        m, v = _cavities(k, tau, nu, hidden)
         # moments of N(m, v) below 0, seen through noise (R&W eq. 3.58)
         sd = np.sqrt(v + noise)
         h = _hazard(-m / sd)
         mean = m - v / sd * h
         variance = v * np.maximum(1 - v / sd**2 * h * (h - m / sd), 1e-9)
         new = np.clip(1 / variance - 1 / v, *PRECISIONS)
-        tau[failing] += DAMPING * (new - tau[failing])
-        nu[failing] += DAMPING * (mean / variance - m / v - nu[failing])
+        tau[hidden] += DAMPING * (new - tau[hidden])
+        nu[hidden] += DAMPING * (mean / variance - m / v - nu[hidden])
         if (np.abs(mean - last) < CONVERGED * np.sqrt(variance)).all():
             break
         last = mean
     return tau, nu
 
 
-def _evidence(k, tau, nu, failing, noise):
+def _evidence(k, tau, nu, hidden, noise):
     """Log probability of what was seen, by the sites (R&W eq. 3.65)."""
     target, matrix = nu / tau, _with_noise(k, 1 / tau)
     value = -0.5 * target @ np.linalg.solve(matrix, target) - 0.5 * _log_det(matrix)
-    value -= 0.5 * (~failing).sum() * math.log(2 * math.pi)
-    if failing.any():
+    value -= 0.5 * (~hidden).sum() * math.log(2 * math.pi)
+    if hidden.any():
         from scipy.special import log_ndtr  # here: slow to import
 
-        m, v = _cavities(k, tau, nu, failing)
-        both = v + 1 / tau[failing]
-        terms = 0.5 * np.log(both) + 0.5 * (m - target[failing]) ** 2 / both
+        m, v = _cavities(k, tau, nu, hidden)
+        both = v + 1 / tau[hidden]
+        terms = 0.5 * np.log(both) + 0.5 * (m - target[hidden]) ** 2 / both
         value += (log_ndtr(-m / np.sqrt(v + noise)) + terms).sum()
     return value
 
 
-def _climb(z, target, extra, failing, logs, prior):
+def _climb(z, target, extra, hidden, logs, prior):
     """Ascents of the likelihood with its sites and the prior, by the signs of the gradient
     (Riedmiller and Braun 1993): the best of ``logs`` on the way.
     """
     step, last = np.full(len(logs), FIRST_STEP), np.zeros(len(logs))
     best, highest = logs, -math.inf
     for _ in range(ASCENTS):
-        value, slope = _likelihood(z, target, extra, failing, logs)
+        value, slope = _likelihood(z, target, extra, hidden, logs)
         value += prior.log_density(logs)
         slope = slope - (logs - prior.mean) / prior.deviation**2
         if value > highest:
@@ -232,11 +232,11 @@ def _climb(z, target, extra, failing, logs, prior):
     return best
 
 
-def _likelihood(z, target, extra, failing, logs):
+def _likelihood(z, target, extra, hidden, logs):
     """Log likelihood of the targets and its gradient (R&W eq. 2.30 and 5.9)."""
     constant, linear, noise = np.exp(logs[:3])
     k, (r, e) = covariance(z, z, logs)
-    matrix = _with_noise(k, np.where(failing, extra, noise))
+    matrix = _with_noise(k, np.where(hidden, extra, noise))
     inverse = np.linalg.inv(matrix)
     alpha = inverse @ target
     w = np.outer(alpha, alpha) - inverse
@@ -246,7 +246,7 @@ def _likelihood(z, target, extra, failing, logs):
     gradient = (
         constant * w.sum(),
         linear * (w * (z @ z.T)).sum(),
-        noise * np.diagonal(w)[~failing].sum(),
+        noise * np.diagonal(w)[~hidden].sum(),
         *(square * np.exp(2 * logs[3:])),
     )
     value = -0.5 * target @ alpha - 0.5 * _log_det(matrix)

@@ -45,8 +45,9 @@ ENOUGH_PLAIN_FAILURES = 1000
 MIN_PLAIN_FAILURES = 10
 """Failures among plain draws from which the probability is roughly known."""
 MAX_PLAIN_ERROR = 0.2
-"""Relative standard error that plain draws promise at most: 25 failures expected, of which chance
-leaves fewer than the ten of a plain answer (`estimate.MIN_COUNTED_FAILURES`) once in 4500."""
+"""Relative standard error that plain draws promise at most, where populations could answer: 25
+failures expected, of which chance leaves fewer than the ten of a plain answer
+(`estimate.MIN_COUNTED_FAILURES`) once in 4500."""
 DOUBT = 1.5
 """How many times as great as promised the standard error of populations may turn out, where it is
 to make them UNRELIABLE anyway. Of 75 calls of eight hard loops of `benchmarks.random_loops` (10 to

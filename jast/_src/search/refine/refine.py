@@ -248,12 +248,12 @@ class _Refinement:
         room = 1 << (max(1, min(POINTS, worth)).bit_length() - 1)
         if 2 * len(self.live) > room or (worth < 1 and self.arrived + self.live):
             return
-        rows, lifts = self._next(room - len(self.live)), [lift(self.v)]
+        rows, lifts = self._next(room - len(self.live)), [slice(None)]
         if self.hosted:  # a black box runs farther out only where it must
-            lifts = np.split(lifts[0], len(LIFTS))
-        for lifted in lifts:
+            lifts = [slice(i, i + 1) for i in range(len(LIFTS))]
+        for some in lifts:
             if rows:
-                rows = self._start_at(rows, lifted[:, rows])
+                rows = self._start_at(rows, lift(self.v[rows])[some])
 
     def _start_at(self, rows, lifted):
         """Start where the least of the lifts, [L, n, D] of ``rows``, fails; returns the rows of
