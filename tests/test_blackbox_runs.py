@@ -14,7 +14,7 @@ import pytest
 
 import jast
 from jast import blackbox
-from jast._src.runtime.host_errors import in_full_batches
+from jast._src.runtime.host_errors import hosts_of, in_full_batches
 from jast.distributions import Normal
 from jast.incidents import incidents
 
@@ -266,6 +266,32 @@ def test_a_report_says_what_went_wrong(key):
     assert only.disturbances[0] > 1.5 and only.count > 1
     assert f"went wrong   {only.count} x raised RuntimeError: no solution" in str(report)
     assert Counted.runs <= 300
+
+
+def refuses_early(disturbances):
+    """The first runs end at once; the others take a twentieth of a second."""
+    if disturbances[0] < 0.5:
+        raise ValueError("not here")
+    time.sleep(0.05)
+    return False, float(disturbances[0])
+
+
+class Slow(blackboxes.Leaves):
+    """Begins at once, and each step takes a twentieth of a second."""
+
+    def transition(self, x):
+        time.sleep(0.05)
+        super().transition(x)
+
+
+@pytest.mark.parametrize("system", [refuses_early, Slow])
+def test_a_checkpoint_has_the_runs_a_few_at_a_time(system):
+    sim = blackbox.from_python(system, horizon=2, disturbance=Normal(0.0, 1.0))
+    (host,), stored = hosts_of(sim), []
+    host.store = lambda part: stored.append(len(part[0]))
+    x = jnp.stack([jnp.linspace(0.4, 0.9, 20), jnp.zeros(20)], axis=1)
+    jax.vmap(lambda x: jast.replay(sim, x).distance)(x).block_until_ready()
+    assert sum(stored) >= 15 and max(stored) <= 4
 
 
 KILLED = """

@@ -21,8 +21,8 @@ from jast._src.runtime.host_errors import Log
 __all__ = ["Calls", "Host"]
 
 KEPT_SECONDS = 0.1
-"""Seconds of runs after which a checkpoint has them: so much a kill loses, or one run; of several
-workers four runs each, so that none waits long for another."""
+"""A checkpoint gets the runs of so many seconds at a time, so a kill loses these. It gets at least
+one run, and of several workers four each, so that few wait for the slowest."""
 
 
 class Calls(NamedTuple):
@@ -74,7 +74,7 @@ class Host:
         self.store: Callable[[list], None] | None = None  # of a checkpoint
         self.told: Callable[[int], None] | None = None
         self.differs = False  # the system answered the same history in two ways
-        self.pace = np.inf  # seconds a run, of the last ones
+        self.last, self.pace = 0, np.inf  # how many runs were made last, and seconds for each
         self.lock = threading.Lock()
         # one callable for each kind of answer, as it is part of what a compiled program is known by
         self.callback = cache(lambda dtype, size: partial(self, dtype, size))
@@ -212,7 +212,8 @@ class Host:
         """After how many runs a checkpoint has them."""
         workers = self.workers()
         least = 1 if workers == 1 else 4 * workers
-        return max(least, int(workers * KEPT_SECONDS / self.pace))
+        # one that ended early, as by an error, does not say how long the next ones take
+        return max(least, min(2 * self.last, int(KEPT_SECONDS / self.pace)))
 
     def _in_doubt(self, before, t):
         """Whether a row with this answer is run once more, to see whether it is answered the same:
@@ -224,8 +225,9 @@ class Host:
         """The `Answer` of each of ``rows`` by its number and its key, which are kept."""
         t, lanes = t[rows], lanes[rows]
         x0, xs = [a[rows] for a in x0], [a[rows] for a in xs]
+        begin = time.perf_counter()
         reply = self.runner(t, x0, xs, lanes)
-        self.pace = max(reply.seconds / len(t), 1e-9)
+        self.last, self.pace = len(t), max(time.perf_counter() - begin, 1e-9) / len(t)
         self.count(episodes=reply.episodes, transitions=reply.transitions)
 
         def example(i):

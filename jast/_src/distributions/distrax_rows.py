@@ -182,9 +182,10 @@ def _inverse(d, verb, x):
     if not _elementwise(d):
         raise ValueError(f"cdf: {type(d).__name__} has no quantile function here to invert")
     try:
-        return verb(d.distribution, d.bijector.inverse(x))
+        y = d.bijector.inverse(x)
     except NotImplementedError:
         raise ValueError(f"cdf: {type(d).__name__} has a bijector without inverse") from None
+    return verb(d.distribution, y)
 
 
 def _cdf_transformed(d, x):

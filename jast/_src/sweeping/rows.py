@@ -75,8 +75,8 @@ def run_here(rows: Rows, follow: bool, store: Checkpoint | None, watch: Watch) -
 def run_in_executor(
     rows: Rows, executor: Executor, store: Checkpoint | None, watch: Watch
 ) -> tuple[list[Outcome], str]:
-    """Likewise, each row a unit of `runtime.work` in the processes of ``executor``: one whose
-    process dies is tried again twice, and then has an error. And words of what ended the rows
+    """The rows that are done, each a unit of `runtime.work` in the processes of ``executor``: one
+    whose process dies is tried again twice, and then has an error. And words of what ended the rows
     early, where it was no interruption.
     """
 

@@ -53,7 +53,7 @@ def number(function, name, value, holds, expected):
     """``value`` as a Python float, the same whatever the precision that JAX is set to, of a number
     for which ``holds``.
     """
-    real_number(function, name, value, holds, expected)
+    _check_number(function, name, value, holds, expected)
     return float(value)
 
 
@@ -62,12 +62,16 @@ def real_number(function, name, value, holds, expected):
     ``holds``.
     """
     if not is_traced(value):
-        try:
-            one = not isinstance(value, str | bool) and np.shape(value) == ()
-            good = one and bool(holds(float(value)))
-        except (TypeError, ValueError):
-            good = False
-        if not good:
-            raise ValueError(f"{function}: {name} must be a number {expected}, received {value!r}")
+        _check_number(function, name, value, holds, expected)
     value = jnp.asarray(value)
     return value if jnp.issubdtype(value.dtype, jnp.floating) else value.astype(jnp.zeros(()).dtype)
+
+
+def _check_number(function, name, value, holds, expected):
+    try:
+        one = not isinstance(value, str | bool) and np.shape(value) == ()
+        good = one and bool(holds(float(value)))
+    except (TypeError, ValueError):
+        good = False
+    if not good:
+        raise ValueError(f"{function}: {name} must be a number {expected}, received {value!r}")
