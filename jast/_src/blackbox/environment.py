@@ -68,9 +68,15 @@ class _Environment:
         action = None if self.agent is None else self.agent(self.now.observation)
         action = x if self.apply is None else self.apply(action, x)
         observation, reward, terminated, truncated, info = self.env.step(action)
-        reward, ends = float(reward), (bool(terminated), bool(truncated))
-        total = self.now.total + reward
-        self.now = Moment(observation, reward, total, *ends, info, self.env)
+        self.now = Moment(
+            observation,
+            reward=float(reward),
+            total=self.now.total + float(reward),
+            terminated=bool(terminated),
+            truncated=bool(truncated),
+            info=info,
+            env=self.env,
+        )
 
     def is_event(self):
         return self.now.terminated if self.event is None else bool(self.event(self.now))

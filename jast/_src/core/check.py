@@ -19,6 +19,7 @@ from jax import lax
 
 from jast import distributions as D
 from jast._src.core.actions import Quantiles, Samples, UniformBox, Wide
+from jast._src.core.lost_failures import warn_of_lost_failures
 from jast._src.core.signature import signature_of
 from jast._src.core.simulator import Simulator, require_simulator
 from jast._src.core.traps import traps
@@ -110,10 +111,7 @@ def check(sim: Simulator, actions: Actions | None = None) -> Simulator:
     _check_twice("step", lambda x0, x: sim.step(sim.init(x0), x), found.x0, found.x)
     for words in traps(sim):
         warnings.warn(f"check: {words}", UserWarning, stacklevel=2)
-    if runs_on_host(sim):
-        from jast._src.blackbox.compare import compare
-
-        compare(sim)
+    warn_of_lost_failures(sim)
     if actions is not None and found.impossible > 0.5:
         box = ""
         if isinstance(actions, UniformBox):
@@ -275,8 +273,11 @@ def _box(box, x):
     for side, end in zip(("low", "high"), box.ends(x), strict=True):
         shapes = map(jnp.shape, jax.tree.leaves(end))
         for leaf, shape in zip(jax.tree.leaves(x), shapes, strict=True):
-            axes = zip(reversed(shape), reversed(leaf.shape))
-            if len(shape) > leaf.ndim or any(a not in (1, b) for a, b in axes):
+            try:
+                fits = np.broadcast_shapes(shape, leaf.shape) == leaf.shape
+            except ValueError:
+                fits = False
+            if not fits:
                 raise ValueError(
                     f"actions.uniform: {side} has shape {shape}, expected one that broadcasts to"
                     f" the disturbance's {leaf.shape}"

@@ -26,8 +26,8 @@ def cell(report: Any) -> str:
     ]
     shown = report_words.shown_failures(report, MODES)
     for i, (failure, picture) in enumerate(zip(shown, _pictures(report))):
-        facts = report_words.mode_facts(report, i, failure)
-        words = " &middot; ".join(text(f"{name} {value}") for name, value in facts)
+        of_mode = report_words.mode_facts(report, i, failure)
+        words = " &middot; ".join(text(f"{name} {value}") for name, value in of_mode)
         parts.append(f"<p><b>Mode {i + 1}</b> {words}</p>{picture}")
     return "".join([*parts, f"<p>{text(report_words.advice(report))}</p>"])
 

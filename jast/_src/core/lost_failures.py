@@ -13,13 +13,13 @@ from jast._src.core.simulator import Simulator
 from jast._src.runtime.host_errors import hosts_of
 from jast._src.util.pytrees import select
 
-__all__ = ["compare"]
+__all__ = ["warn_of_lost_failures"]
 
 EPISODES = 16  # half of them drawn from the model, half from its tails, where failures are
 TAIL = 0.02  # the probability of both tails together
 
 
-def compare(sim: Simulator) -> None:
+def warn_of_lost_failures(sim: Simulator) -> None:
     """Warn (UserWarning) where episodes of ``sim``, whose objects are judged at the end only, fail
     on the way and no longer at the end.
 
