@@ -9,8 +9,6 @@ from jast._src.util.display import html_table
 
 __all__ = ["cell"]
 
-MODES = 4  # that are shown
-
 
 def cell(report: Any) -> str:
     """HTML without styles or scripts of its own: what was found, the probability with its interval
@@ -24,20 +22,20 @@ def cell(report: Any) -> str:
         f"<p>Probability of failure: <b>{text(told.value)}</b> {text(told.more)}<br>",
         f"{text(told.badge)}</p><ul>{reasons}</ul>{html_table('', facts)}",
     ]
-    shown = report_words.shown_failures(report, MODES)
-    for i, (failure, picture) in enumerate(zip(shown, _pictures(report))):
+    shown = report_words.shown_failures(report)
+    for i, (failure, picture) in enumerate(zip(shown, _pictures(report, len(shown)), strict=True)):
         of_mode = report_words.mode_facts(report, i, failure)
         words = " &middot; ".join(text(f"{name} {value}") for name, value in of_mode)
         parts.append(f"<p><b>Mode {i + 1}</b> {words}</p>{picture}")
     return "".join([*parts, f"<p>{text(report_words.advice(report))}</p>"])
 
 
-def _pictures(report: Any) -> list[str]:
-    """An image of each mode."""
+def _pictures(report: Any, n: int) -> list[str]:
+    """An image of each of the ``n`` failures that are shown."""
     try:
         from jast._src.plot.report import pictures
 
         files = pictures(report)
     except ImportError:  # matplotlib, which is an extra
-        return [""] * len(report.modes[:MODES])
+        return [""] * n
     return [f'<img src="data:image/png;base64,{b64encode(f).decode()}">' for f in files]

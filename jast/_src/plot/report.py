@@ -32,7 +32,6 @@ MARGIN = 0.55  # inches
 LINE = 0.185  # inches: of a line of words
 MODE = 1.62  # inches: of a failure mode
 PANEL = 1.02  # inches: of its panels
-MODES = 4  # that are drawn
 FAILURES = 12  # of each mode, behind its likeliest
 DOTS = 80  # to the inch, in a notebook
 COLOURS = 32  # different ones there: a quarter of the bytes of all colours
@@ -79,7 +78,7 @@ def report(
             f"plot.report: report must be of jast.stress, received a {type(report).__name__}"
         )
     sim = report.sim if sim is None else sim
-    shown = report_words.shown_failures(report, MODES)
+    shown = report_words.shown_failures(report)
     told = report_words.belief(report.probability)
     left = _probability_rows(told)
     right = _wrapped(report_words.fact_rows(report), 43)
@@ -115,7 +114,7 @@ def pictures(report: Report) -> list[bytes]:
     which would be called again, they have disturbances alone.
     """
     sim = None if report.sim is None or runs_on_host(report.sim) else report.sim
-    shown, files = report_words.shown_failures(report, MODES), []
+    shown, files = report_words.shown_failures(report), []
     frugal = style.frugal_figure(COLOURS)
     with style.styled():
         owned = _series_of_modes(report, sim, shown, None) if shown else None

@@ -28,6 +28,8 @@ MAX_RESIDUAL = 0.05
 
 SHOWN_INCIDENTS = 3
 """Kinds of what went wrong in a black box that are shown."""
+DRAWN_MODES = 4
+"""Modes whose failure a picture of the report shows, and a notebook's cell: as many as fit."""
 
 
 class Belief(NamedTuple):
@@ -199,7 +201,7 @@ def fact_rows(r: Any) -> list[tuple[str, str]]:
     return [*rows, ("evaluations", f"{r.episodes:,}")]
 
 
-def shown_failures(r: Any, most: int) -> list[Any]:
+def shown_failures(r: Any, most: int = DRAWN_MODES) -> list[Any]:
     """The likeliest failure of each of the first ``most`` modes; where there are no modes, the best
     failure, if there is one.
     """

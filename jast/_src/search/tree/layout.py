@@ -316,7 +316,7 @@ def flags(outcome):
 
 
 def node_shapes(tree, memoize):
-    """The `shapes` of one tree's `Node`."""
+    """The shapes and dtypes of one tree's `Node`."""
     number, real, flag = (
         jax.ShapeDtypeStruct((), dtype) for dtype in (jnp.int32, tree.edges.dtype, jnp.bool_)
     )
