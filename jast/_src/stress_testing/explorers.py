@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jast._src.core.actions import wide
+from jast._src.core.counter_prng import numpy_generator
 from jast._src.core.episode import Episode
 from jast._src.core.failures import empty
 from jast._src.core.rewards import likelihood
@@ -18,6 +19,7 @@ from jast._src.core.simulator import Simulator
 from jast._src.estimate.gaussians.design_points import design_points
 from jast._src.estimate.host_populations import cool, explore
 from jast._src.normal_space import transform
+from jast._src.normal_space.evaluate_points import evaluate_points, lanes_of
 from jast._src.normal_space.mode_coordinates import centred
 from jast._src.runtime.host_errors import runs_on_host
 from jast._src.search.cem import cem
@@ -79,9 +81,22 @@ class ExplorerResult(NamedTuple):
 
 
 def plain_draws(key: jax.Array, sim: Simulator, budget: int) -> ExplorerResult:
-    """Draws of the model."""
-    reward = likelihood(sim)
-    return _from_search(monte_carlo(key, sim, episodes=budget, reward=reward, top=MAX_FAILURES))
+    """Draws of the model; points, for the program that judges these is compiled anyway."""
+    if not has_quantiles(sim):
+        reward = likelihood(sim)
+        return _from_search(monte_carlo(key, sim, episodes=budget, reward=reward, top=MAX_FAILURES))
+    rng, d = numpy_generator(key), transform.dimension(sim)
+    failures = np.zeros((0, d), transform.normal_numbers(sim))
+    log_p, failing, invalid = np.zeros(0), 0, 0
+    for begin in range(0, budget, size := lanes_of(d)):
+        z = rng.standard_normal((min(size, budget - begin), d)).astype(failures.dtype)
+        o = evaluate_points(sim, z)
+        failing, invalid = failing + o.failure.sum(), invalid + o.invalid.sum()
+        failures = np.concatenate([failures, z[o.failure]])
+        log_p = np.concatenate([log_p, o.log_p[o.failure]])
+        best = np.argsort(-log_p, kind="stable")[:MAX_FAILURES]
+        failures, log_p = failures[best], log_p[best]
+    return ExplorerResult(failures_at(sim, failures).episodes, budget, int(failing), int(invalid))
 
 
 def falsified(key: jax.Array, sim: Simulator, budget: int) -> ExplorerResult:
