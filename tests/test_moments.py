@@ -6,18 +6,26 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scipy.stats import norm
+from scipy.stats import multivariate_normal, norm
 
 import jast
 from benchmarks.few_calls import SlowLane, plane, planes, slow_lane
 from benchmarks.first_minute import lane
 from jast._src.estimate.gaussians import half_spaces
 from jast._src.estimate.gaussians.family import GaussianFamily
+from jast._src.estimate.gaussians.mixture_fit import (
+    as_latent,
+    latent_along,
+    mix,
+    unit_gaussians,
+)
 from jast._src.estimate.gaussians.moments import explore_moments
 from jast._src.estimate.host_populations import draw_wide
 from jast._src.estimate.proposal_search.audit import FORGOTTEN, audit_proposal
+from jast._src.estimate.proposal_search.mixture_draws import random_numbers
 from jast._src.estimate.proposal_search.search_state import search_context
 from jast._src.estimate.proposal_search.settings import FEW_RUNS
+from jast._src.normal_space import transform
 from jast._src.normal_space.moments import distances, slopes
 from jast.estimate import failure_probability
 from jast.simulators import limit_state
@@ -198,3 +206,59 @@ def test_layers_that_failures_lie_before_come_nearer_and_others_stay():
         assert (moved < -0.3) == nearer
         assert (layers.variance >= first.variance - 1e-12).all()
         assert layers.share.sum() == pytest.approx(1)
+
+
+@pytest.fixture
+def along(dtype):
+    """A `Latent` of three Gaussians of four numbers, the last of which is the model, and what it is
+    made of.
+    """
+    rng = np.random.default_rng(2)
+    ways = np.linalg.qr(rng.standard_normal((4, 4)))[0][:3]
+    means, variances = np.array([[3.0, 0, -1, 1], [0, 2, 0, -2], [0, 0, 0, 0]]), [0.2, 4.0, 1.0]
+    covariances = [np.eye(4) + (v - 1) * np.outer(a, a) for a, v in zip(ways, variances)]
+    q = latent_along(np.array([5.0, 3.0, 2.0]), means, ways, np.array(variances), dtype)
+    return q, means, covariances
+
+
+def test_densities_of_one_direction_are_those_of_scipy(along, dtype):
+    """Over the used numbers alone, their marginal; and so are those of a mixture that has other
+    Gaussians beside them, which are factored.
+    """
+    q, means, covariances = along
+    z = 2 * np.random.default_rng(3).standard_normal((40, 4)).astype(dtype)
+    used = np.arange(40) % 5
+    expected = [
+        [
+            multivariate_normal.logpdf(x[:m], mean[:m], c[:m, :m]) - norm.logpdf(x[:m]).sum()
+            if m
+            else 0.0
+            for mean, c in zip(means, covariances)
+        ]
+        for x, m in zip(z, used)
+    ]
+    close = 1e-4 if dtype == "float32" else 1e-9
+    np.testing.assert_allclose(transform.log_ratios(q, z, used), expected, atol=close)
+    other = as_latent([(1.0, unit_gaussians(np.ones((1, 4))))], dtype)
+    both = mix(q, other, 0.1)
+    assert both.directions is None and both.means.dtype == dtype
+    np.testing.assert_allclose(np.exp(both.log_weights), [0.45, 0.27, 0.18, 0.1], rtol=1e-5)
+    np.testing.assert_allclose(transform.log_ratios(both, z, used)[:, :3], expected, atol=close)
+    same = mix(q, q, 0.5)
+    assert same.factors is None and len(same.means) == 6
+
+
+def test_draws_of_one_direction_have_its_moments(along, dtype):
+    """20,000 draws, within 4.5 standard errors of each."""
+    q, means, covariances = along
+    assert transform.is_model(q).tolist() == [False, False, True]
+    np.testing.assert_allclose(np.exp(q.log_weights), [0.5, 0.3, 0.2], rtol=1e-6)
+    u, e = random_numbers(jax.random.key(0), 20_000, 4, dtype)
+    z, own = transform.place(q, u, e), transform.component(q, u)
+    assert z.dtype == dtype and (z[own == 2] == e[own == 2]).all()
+    for k in range(3):
+        mine, n = z[own == k].astype(float), (own == k).sum()
+        size = np.sqrt(np.diag(covariances[k]))
+        assert (abs(mine.mean(axis=0) - means[k]) < 4.5 * size / n**0.5).all()
+        apart = abs(np.cov(mine.T) - covariances[k])
+        assert (apart < 4.5 * (2 / n) ** 0.5 * np.outer(size, size)).all()

@@ -94,16 +94,22 @@ class Outcomes(NamedTuple):
 
 
 class Latent(NamedTuple):
-    """A mixture of K Gaussians over z [D], one drawn a trace."""
+    """A mixture of K Gaussians over z [D], one drawn a trace. Their covariances are factored; where
+    each is that of the model but along one direction, that and its variance stand in their place.
+    """
 
     log_weights: Array
     """[K], of sum 1 as probabilities; -inf for a component that is not used"""
     means: Array
     """[K, D]"""
-    factors: Array
+    factors: Array | None = None
     """[K, D, D] lower Cholesky factors of the covariances"""
-    inverses: Array
+    inverses: Array | None = None
     """[K, D, D] their inverses"""
+    directions: Array | None = None
+    """[K, D] of norm 1"""
+    variances: Array | None = None
+    """[K] along these"""
 
 
 def check(function: str, sim: Simulator) -> None:
@@ -229,7 +235,11 @@ def place(q: Latent, u: np.ndarray, e: np.ndarray) -> np.ndarray:
     k, z = component(q, u), np.empty_like(e)
     for i in np.unique(k):
         rows = k == i
-        z[rows] = np.asarray(q.means[i]) + product(e[rows], np.asarray(q.factors[i]).T)
+        if q.directions is None:
+            z[rows] = np.asarray(q.means[i]) + product(e[rows], np.asarray(q.factors[i]).T)
+        else:
+            way, wider = np.asarray(q.directions[i])[None], np.sqrt(q.variances[i]) - 1
+            z[rows] = np.asarray(q.means[i]) + e[rows] + wider * product(e[rows], way.T) * way
     return z
 
 
@@ -241,7 +251,10 @@ def component(q: Latent, u: np.ndarray) -> np.ndarray:
 
 def is_model(q: Latent) -> np.ndarray:
     """Which components [K] are the model itself: their draws are plain ones."""
-    unit = (np.asarray(q.factors) == np.eye(q.means.shape[1])).all(axis=(1, 2))
+    if q.directions is None:
+        unit = (np.asarray(q.factors) == np.eye(q.means.shape[1])).all(axis=(1, 2))
+    else:
+        unit = np.asarray(q.variances) == 1
     return unit & ~np.asarray(q.means).any(axis=1)
 
 
@@ -249,6 +262,8 @@ def log_ratios(q: Latent, z: np.ndarray, used: np.ndarray) -> np.ndarray:
     """log q_k - log p [n, K] over the first ``used`` [n] numbers of each of ``z`` [n, D], 0 for
     components that are not used. On the host.
     """
+    if q.directions is not None:
+        return _log_ratios_along(q, z, used)
     live, (n, d) = _live(q), z.shape
     means, inverses = (np.asarray(a)[:live].astype(z.dtype) for a in (q.means, q.inverses))
     shift = np.einsum("kij,kj->ki", inverses, means)[:, None]
@@ -266,6 +281,30 @@ def log_ratios(q: Latent, z: np.ndarray, used: np.ndarray) -> np.ndarray:
             gap *= np.arange(d) < m[:, None]
         ratio = 0.5 * np.einsum("knd,knd->kn", gap, part + e) + volumes[:, m]
         out[i : i + rows, :live] = ratio.T
+    return out
+
+
+def _log_ratios_along(q, z, used):
+    """The same of Gaussians that are the model's but along one direction: of the first numbers of z
+    the covariance is I + (variance - 1) a a^T, with what the direction has of them as a.
+    """
+    live, (n, d) = _live(q), z.shape
+    fields = q.means, q.directions, q.variances
+    means, ways, variances = (np.asarray(a, np.float64)[:live] for a in fields)
+
+    def of_first(a):
+        """Sums [m, K] of the first numbers of ``a`` [K, D]."""
+        return np.concatenate([np.zeros((1, live)), np.cumsum(a, axis=1).T])
+
+    squares, along, size = of_first(means**2), of_first(means * ways), of_first(ways**2)
+    out, rows = np.zeros((n, len(q.log_weights))), max(ROWS // d, 1)
+    for i in range(0, n, rows):
+        m = used[i : i + rows]
+        part = np.where(np.arange(d) < m[:, None], z[i : i + rows], 0).astype(np.float64)
+        gap, wider = product(part, ways.T) - along[m], (variances - 1) * size[m]
+        # determinant and inverse of 1 + a rank: 1 + wider, and I - (variance - 1) a a^T / that
+        bend = (variances - 1) * gap**2 / (1 + wider) - np.log1p(wider)
+        out[i : i + rows, :live] = product(part, means.T) - 0.5 * squares[m] + 0.5 * bend
     return out
 
 

@@ -21,7 +21,6 @@ from jast._src.estimate.few_calls.active_learning import CANDIDATES, Learner, ch
 from jast._src.estimate.few_calls.surrogate_pool import expected
 from jast._src.estimate.gaussians.design_points import distinct
 from jast._src.estimate.monte_carlo import plain_traces
-from jast._src.normal_space.transform import Latent
 from jast._src.runtime._jax import was_interrupted
 from jast._src.runtime.progress_bar import Watch
 from jast._src.util.intervals import log_normal, normal_quantile
@@ -170,7 +169,7 @@ def _estimate(learner, rounds, level):
         reliable=not reasons,
         warnings=tuple(reasons),
         unseen=unseen,
-        proposal=Latent(*(np.asarray(a, learner.dtype) for a in mixture)),
+        proposal=jax.tree.map(lambda a: np.asarray(a, learner.dtype), mixture),
         history=tuple(learner.history),
         plain=learner.plain,
     )

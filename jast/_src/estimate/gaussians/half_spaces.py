@@ -15,11 +15,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jast._src.estimate.gaussians.mixture_fit import (
-    Gaussians,
-    as_latent,
     effective_sample_size,
+    latent_along,
     most_components,
-    unit_gaussians,
 )
 from jast._src.estimate.proposal_search.settings import SETTINGS
 from jast._src.normal_space.moments import Linearised
@@ -46,8 +44,7 @@ ALIKE = 0.97
 (key 0, 5000 evaluations) 24 stay of 128, and batches of 200 have effective sample sizes of 70, 58
 and 42 in place of 32, 10 and 29."""
 MOST = 64
-"""Half-spaces of a proposal at most: densities take their number times that of the numbers
-squared."""
+"""Half-spaces of a proposal at most. A convention."""
 SPREAD = 2.0
 """Factor on the variance beyond a plane: with it, and a fifth of wide copies at the same place, .45
 effective draws a draw where the plane is right, .21 where the boundary is .3 standard deviations
@@ -160,20 +157,13 @@ def first_layers(planes: Planes) -> Layers:
 
 def layers_as_latent(planes: Planes, layers: Layers, dtype: Any) -> Latent:
     """The `Latent` of two ``layers`` of Gaussians beyond each of the ``planes``."""
-    k, d = planes.normal.shape
-    # the reflection that takes the first axis to the normal
-    way = planes.normal - np.eye(d)[0]
-    size = np.maximum((way**2).sum(axis=1), 1e-12)
-    vectors = np.eye(d) - 2 * way[:, :, None] * way[:, None] / size[:, None, None]
-    parts = []
-    for share, mean, variance in zip(*layers, strict=True):
-        values = np.ones((k, d))
-        values[:, 0] = variance
-        means = mean[:, None] * planes.normal
-        parts.append((share.sum(), Gaussians(share / share.sum(), means, values, vectors)))
+    means = (layers.mean[..., None] * planes.normal).reshape(-1, planes.normal.shape[1])
+    ways = np.concatenate([planes.normal, planes.normal])
+    parts = layers.share.ravel(), means, ways, layers.variance.ravel()
     if planes.log_mass.max() > math.log(SETTINGS.rare_probability):
-        parts.append((SETTINGS.model_share, unit_gaussians(np.zeros((1, d)))))
-    return as_latent(parts, dtype)
+        model = SETTINGS.model_share, np.zeros_like(means[0]), ways[0], 1.0
+        parts = (np.concatenate([a, np.array(b)[None]]) for a, b in zip(parts, model, strict=True))
+    return latent_along(*parts, dtype)
 
 
 def fit_layers(z: np.ndarray, log_weight: np.ndarray, planes: Planes, first: Layers) -> Layers:

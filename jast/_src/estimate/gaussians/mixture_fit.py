@@ -8,6 +8,7 @@ one that the other half of the sample likes best.
 
 from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 
 from jast._src.normal_space.transform import Latent
@@ -18,6 +19,7 @@ __all__ = [
     "as_latent",
     "effective_sample_size",
     "fit_mixture",
+    "latent_along",
     "log_sum",
     "mix",
     "most_components",
@@ -151,24 +153,56 @@ def as_latent(parts: list[tuple[float, Gaussians]], dtype: Any) -> Latent:
     weights = weights[kept]
     means, values, vectors = (np.concatenate([g[i] for _, g in parts])[kept] for i in (1, 2, 3))
     covariances = (vectors * values[:, None]) @ vectors.transpose(0, 2, 1)
-    factors = np.linalg.cholesky(covariances)
-    log_weights = np.log(weights / weights.sum())
-    arrays = log_weights, means, factors, np.tril(np.linalg.inv(factors))
+    arrays = np.log(weights / weights.sum()), means, *_factored(covariances)
     return Latent(*(np.asarray(a, dtype) for a in arrays))
+
+
+def latent_along(
+    weights: np.ndarray, means: np.ndarray, ways: np.ndarray, variances: np.ndarray, dtype: Any
+) -> Latent:
+    """The `Latent` of the greatest of K Gaussians that are the model's but along their ``ways``
+    [K, D]; ``weights`` of any sum.
+    """
+    kept = _greatest(weights, means.shape[1])
+    weights = weights[kept]
+    q = Latent(
+        log_weights=np.log(weights / weights.sum()),
+        means=means[kept],
+        directions=ways[kept],
+        variances=variances[kept],
+    )
+    return jax.tree.map(lambda a: np.asarray(a, dtype), q)
+
+
+def _factored(covariances):
+    """Their lower Cholesky factors, and the inverses of these."""
+    factors = np.linalg.cholesky(covariances)
+    return factors, np.tril(np.linalg.inv(factors))
+
+
+def _with_factors(q):
+    """The same `Latent` with factors."""
+    if q.directions is None:
+        return q
+    ways, wider = np.asarray(q.directions, np.float64), np.asarray(q.variances, np.float64) - 1
+    covariances = np.eye(ways.shape[1]) + wider[:, None, None] * ways[:, :, None] * ways[:, None]
+    factors = (a.astype(q.means.dtype) for a in _factored(covariances))
+    return Latent(q.log_weights, q.means, *factors)
 
 
 def mix(a: Latent, b: Latent, share: float) -> Latent:
     """The mixture of two `Latent`, ``share`` of the second; of their components the least give
     way.
     """
+    if (a.directions is None) != (b.directions is None):
+        a, b = _with_factors(a), _with_factors(b)
     weights = np.concatenate(
         [np.exp(np.asarray(q.log_weights, np.float64)) * s for q, s in ((a, 1 - share), (b, share))]
     )
     kept = _greatest(weights, a.means.shape[1])
-    return Latent(
-        np.asarray(np.log(weights[kept] / weights[kept].sum()), a.means.dtype),
-        *(np.concatenate(each)[kept] for each in zip(a[1:], b[1:], strict=True)),
-    )
+    both = jax.tree.map(lambda a, b: np.concatenate([a, b])[kept], a, b)
+    log_weights = np.log(weights[kept] / weights[kept].sum())
+    return both._replace(log_weights=np.asarray(log_weights, a.means.dtype))
 
 
 def most_components(d: int) -> int:
