@@ -14,7 +14,12 @@ from jast._src.estimate.diagnostics import mode_warnings
 from jast._src.estimate.gaussians.design_points import explained
 from jast._src.estimate.gaussians.exploration import explore_failures
 from jast._src.estimate.gaussians.family import GaussianFamily, _fit_sparse
-from jast._src.estimate.gaussians.mixture_fit import _greatest, most_components, shrink_to_anchors
+from jast._src.estimate.gaussians.mixture_fit import (
+    _greatest,
+    _with_factors,
+    most_components,
+    shrink_to_anchors,
+)
 from jast._src.estimate.host_populations import PopulationSampler, bracket_boundary, cool
 from jast._src.estimate.proposal_search.search_state import SearchState, search_context
 from jast._src.normal_space import transform as L
@@ -137,7 +142,7 @@ def test_a_sparse_proposal_differs_from_the_model_in_the_numbers_that_matter(key
     mine = np.repeat(np.arange(d), 50)
     points[np.arange(len(points)), mine] = 4 + rng.exponential(0.22, size=len(points))
     state = SearchState(anchors=anchors, log_weight=np.zeros(len(points)))
-    q = _fit_sparse(f, state, points, anchors)
+    q = _with_factors(_fit_sparse(f, state, points, anchors))
     own = np.argmax(np.asarray(q.means), axis=1)
     narrow = np.asarray([f[i, i] < 0.9 for f, i in zip(q.factors, own, strict=True)])
     assert len(q.means) == 2 * d and narrow.sum() == d

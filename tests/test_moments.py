@@ -239,7 +239,9 @@ def test_densities_of_one_direction_are_those_of_scipy(along, dtype):
     ]
     close = 1e-4 if dtype == "float32" else 1e-9
     np.testing.assert_allclose(transform.log_ratios(q, z, used), expected, atol=close)
-    other = as_latent([(1.0, unit_gaussians(np.ones((1, 4))))], dtype)
+    unit = unit_gaussians(np.ones((1, 4)))
+    assert as_latent([(1.0, unit)], dtype).factors is None
+    other = as_latent([(1.0, unit._replace(values=2 * unit.values))], dtype)
     both = mix(q, other, 0.1)
     assert both.directions is None and both.means.dtype == dtype
     np.testing.assert_allclose(np.exp(both.log_weights), [0.45, 0.27, 0.18, 0.1], rtol=1e-5)

@@ -19,7 +19,6 @@ from jast._src.estimate.gaussians.mixture_fit import (
     as_latent,
     effective_sample_size,
     fit_mixture,
-    latent_along,
     mix,
     most_components,
     nearest_centre,
@@ -92,8 +91,7 @@ class GaussianFamily(NamedTuple):
 
     def model(self) -> transform.Latent:
         """The model itself as a proposal."""
-        one, way = np.ones(1), np.eye(1, self.dimension)
-        return latent_along(one, np.zeros_like(way), way, one, self.dtype)
+        return as_latent([(1.0, unit_gaussians(np.zeros((1, self.dimension))))], self.dtype)
 
     def draw(self, q: transform.Latent) -> Batch:
         numbers = random_numbers(self.context.rng, self.batch, self.dimension, self.dtype)

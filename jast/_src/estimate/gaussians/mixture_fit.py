@@ -149,9 +149,13 @@ def _fit(rng, points, weights, count, covariance_count, limit, anchors):
 def as_latent(parts: list[tuple[float, Gaussians]], dtype: Any) -> Latent:
     """The `Latent` of [(share, Gaussians), ...], of its greatest components; shares of any sum."""
     weights = np.concatenate([share * g.weights for share, g in parts])
-    kept = _greatest(weights, parts[0][1].means.shape[1])
-    weights = weights[kept]
-    means, values, vectors = (np.concatenate([g[i] for _, g in parts])[kept] for i in (1, 2, 3))
+    means, values, vectors = (np.concatenate([g[i] for _, g in parts]) for i in (1, 2, 3))
+    other = values != 1
+    if other.sum(axis=1).max() <= 1:
+        k, way = np.arange(len(weights)), other.argmax(axis=1)
+        return latent_along(weights, means, vectors[k, :, way], values[k, way], dtype)
+    kept = _greatest(weights, means.shape[1])
+    weights, means, values, vectors = (a[kept] for a in (weights, means, values, vectors))
     covariances = (vectors * values[:, None]) @ vectors.transpose(0, 2, 1)
     arrays = np.log(weights / weights.sum()), means, *_factored(covariances)
     return Latent(*(np.asarray(a, dtype) for a in arrays))
