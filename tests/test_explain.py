@@ -245,6 +245,8 @@ def test_bad_input(key):
         explain.attribution(sim, failing, "lime")
     with pytest.raises(ValueError, match="criticality: draws"):
         explain.criticality(key, sim, failing, draws=0)
+    with pytest.raises(ValueError, match="regression: sim must be"):
+        explain.regression(walk(4.0), None)
     with pytest.raises(ValueError, match="regression: disturbance"):
         explain.regression(sim, slips())
     with pytest.raises(ValueError, match="sensitivity: estimate"):

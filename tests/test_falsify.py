@@ -47,6 +47,15 @@ def test_the_same_key_gives_the_same_search(key, equal):
     assert np.all(np.diff(one.history.best_reward[:, 0]) >= 0)
 
 
+def test_failures_that_are_found_again_are_counted(key):
+    """Most walks that are pushed one way for long fail at once: equal episodes are one failure."""
+    found = falsify(
+        key, jast.simulators.walk1d(threshold=3.0), simulations=100, stop=False, top=400
+    )
+    assert found.failures.counts.sum() == found.failures.seen == found.failing
+    assert found.failures.counts.max() > 1
+
+
 @pytest.mark.slow
 def test_it_climbs_where_no_draw_fails(key):
     """The level must stay in a narrow band: no corner fails."""

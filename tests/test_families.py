@@ -371,3 +371,34 @@ def test_a_family_of_the_users_own_is_one_row(dtype, key):
         D.register(Rayleigh, cdf=3)
     with pytest.raises(ValueError, match='register: expected a class or "package:Class"'):
         D.register("Rayleigh", cdf=lambda d, x: x)
+
+
+def test_counts_at_the_edge_of_their_parameters(dtype):
+    """All of the probability is at one number."""
+    for d, all_at, none_at in (
+        (D.Poisson(0.0), 0, 1),
+        (D.Geometric(1.0), 0, 1),
+        (D.Binomial(5.0, 1.0), 5, 4),
+        (D.Binomial(5.0, 0.0), 0, 1),
+    ):
+        assert abs(d.log_prob(all_at)) < 1e-6 and d.log_prob(none_at) == -jnp.inf
+        below, above = d.log_tails(jnp.asarray([-1.0, all_at]))
+        assert below.tolist() == [-np.inf, 0] and above.tolist() == [0, -np.inf]
+        x = D.from_normal(d, jnp.linspace(-4, 4, 9))
+        assert (x == all_at).all()
+
+
+def test_a_mixture_of_counts_has_no_quantile_function():
+    """Newton's rule would come to numbers between whole ones, whose probability is 0."""
+    each = D.Poisson(jnp.array([2.0, 20.0]))
+    d = D.MixtureSameFamily(D.Categorical(probs=jnp.array([0.5, 0.5])), each)
+    assert not D.has_quantile(d) and jnp.isfinite(d.log_prob(3))
+    with pytest.raises(ValueError, match="quantile: MixtureSameFamily has no quantile function"):
+        D.quantile(d, jnp.array(0.5))
+
+
+def test_whole_numbers_are_settings_of_a_tent_and_seeds_of_a_choice():
+    assert D.tent(0, 0.5).log_prob(0.1) == D.tent(0.0, 0.5).log_prob(0.1) > 0
+    assert 0 <= D.tent(0, 0.5).sample(seed=3) < 0.5
+    d = D.where(True, D.Normal(0.0, 1.0), D.Normal(1.0, 1.0))
+    assert d.sample(seed=3) == D.Normal(0.0, 1.0).sample(seed=3)

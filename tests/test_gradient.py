@@ -59,7 +59,8 @@ def test_a_random_start(key, equal):
 
 
 def test_a_flat_distance_gives_no_failure_and_says_why(key):
-    r = gradient(key, stress_systems.latch(10), **SMALL)
+    sim = stress_systems.latch(10)
+    r = gradient(key, sim, **SMALL)
     assert not r.failing
     assert r.failures.size == 0
     assert r.first_failure is None
@@ -67,6 +68,10 @@ def test_a_flat_distance_gives_no_failure_and_says_why(key):
     assert not r.best.failure
     assert r.best.distance == 1
     assert r.episodes == 1920
+    # the episode that came nearest has the reward of the search, wherever it is told
+    nearest = jast.replay(sim, r.best, reward=RELATIVE).reward
+    assert float(r.best.reward) == pytest.approx(float(nearest), rel=1e-6)
+    assert float(r.best_reward_per_tree[0]) == float(r.best.reward)
 
 
 def test_nan_is_counted_and_never_best(key):

@@ -54,6 +54,14 @@ def test_sweep_and_gradient(name, key):
         (lambda: ruin(start=0), "ruin: start must be a whole number of at least 1, received 0"),
         (lambda: ruin(start=3, goal=3), "ruin: goal must be above start = 3, received 3"),
         (
+            lambda: ruin_probability(0.4, 5, 3),
+            "ruin_probability: goal must be above start = 5, received 3",
+        ),
+        (
+            lambda: ruin_probability(0.4, 0, 3, horizon=10),
+            "ruin_probability: start must be a whole number of at least 1",
+        ),
+        (
             lambda: ruin_probability(up="even"),
             "ruin_probability: up must be a number between 0 and 1",
         ),

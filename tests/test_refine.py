@@ -248,3 +248,7 @@ def test_what_are_no_failures_is_refused(key):
         ValueError, match="refine: failures must be an archive .* received NoneType"
     ):
         refine(key, linear(4), None)
+    with pytest.raises(ValueError, match="modes: likeliest must be an archive .* received list"):
+        modes(linear(4), [])
+    with pytest.raises(ValueError, match="modes: others must be an archive .* received int"):
+        modes(linear(4), draws(linear(4), 1.0), 3)

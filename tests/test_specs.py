@@ -289,3 +289,11 @@ def test_errors_name_the_part(name):
 def test_what_is_no_formula_is_refused(make, said):
     with pytest.raises(ValueError, match=said):
         make()
+
+
+def test_robustness_of_what_is_no_formula_is_refused():
+    for ask in (robustness, parts):
+        with pytest.raises(
+            ValueError, match="robustness: formula must be a formula, as jast.specs"
+        ):
+            ask(lambda s: 5.0 - s, jnp.ones(3), 1.0)

@@ -91,6 +91,11 @@ def test_what_cannot_be_traced_compiles_apart(of, limits, n):
     assert count_kinds(made) == n
 
 
+def test_values_may_be_lists_of_different_lengths(key):
+    table = jast.sweep(key, lambda ws: make(sum(ws)), {"ws": [[0.5, 0.5], [1.0]]}, jast.nominal)
+    assert table.results[0].rate > 0 and table.values == {"ws": ([0.5, 0.5], [1.0])}
+
+
 def test_simulators_of_one_kind_are_taken_as_they_are():
     sims = [jast.simulators.walk1d(threshold=v) for v in (3.0, 4.0)]
     assert all(a is b for a, b in zip(make_simulators(sims, [{}, {}]), sims))
@@ -282,6 +287,7 @@ BAD = {
     "values must be a dict of name -> values, .*received {}": dict(values={}),
     "limit must be a sequence of values, received 'text'": dict(values={"limit": "text"}),
     "limit must be a sequence of values, received 3": dict(values={"limit": 3}),
+    r"limit must be a sequence of values, received \{4\}": dict(values={"limit": {4}}),
     r"equally many for each setting, at least 1, received {'limit': 2, 'other': 1}": dict(
         values={"limit": [1, 2], "other": [1]}
     ),

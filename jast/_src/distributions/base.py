@@ -17,6 +17,7 @@ __all__ = [
     "Distribution",
     "Elementwise",
     "Wrapped",
+    "as_key",
     "broadcast",
     "float_array",
     "is_distribution",
@@ -92,8 +93,7 @@ class Distribution(metaclass=_Kind):
         if not isinstance(sample_shape, Sequence):
             sample_shape = (sample_shape,)
         shape = tuple(map(int, sample_shape))
-        key = jax.random.PRNGKey(seed) if isinstance(seed, (int, np.signedinteger)) else seed
-        values = self._sample_n(key, prod(shape))
+        values = self._sample_n(as_key(seed), prod(shape))
         return jax.tree.map(lambda a: a.reshape(shape + a.shape[1:]), values)
 
     def sample_and_log_prob(self, *, seed: Any, sample_shape: int | Sequence[int] = ()) -> Any:
@@ -153,6 +153,11 @@ def is_distribution(d: Any) -> bool:
 def tree_map(function: Callable[..., Any], distributions: Any, *rest: Any) -> Any:
     """``jax.tree.map`` over a structure whose leaves are distributions."""
     return jax.tree.map(function, distributions, *rest, is_leaf=is_distribution)
+
+
+def as_key(seed: Any) -> PRNGKey:
+    """The key of a ``seed``, which is one, or a whole number."""
+    return jax.random.PRNGKey(seed) if isinstance(seed, (int, np.signedinteger)) else seed
 
 
 def float_array(x: Any) -> Any:

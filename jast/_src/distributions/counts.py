@@ -12,10 +12,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.lax import lgamma, stop_gradient
-from jax.scipy.special import betainc, gammainc, gammaincc
+from jax.scipy.special import betainc, gammainc, gammaincc, xlog1py
 
 from jast._src.core.typing import Array, Numeric, PRNGKey
 from jast._src.distributions.base import Elementwise, float_array
+from jast._src.distributions.continuous import log_power
 from jast._src.distributions.family_table import register
 from jast._src.distributions.normal_tails import (
     inside,
@@ -151,10 +152,10 @@ class Geometric(_Counts):
         return jnp.maximum(k, 0).astype(self.dtype)
 
     def _log_p(self, k):
-        return jnp.log(self.probs) + k * jnp.log1p(-self.probs)
+        return jnp.log(self.probs) + xlog1py(k, -self.probs)
 
     def log_tails(self, k: int) -> tuple[Array, Array]:
-        above = (k + 1) * jnp.log1p(-self.probs)
+        above = xlog1py(k + 1, -self.probs)
         return log_one_less(above), above
 
     def mean(self) -> Any:
@@ -193,10 +194,12 @@ class Poisson(_Counts):
         return special.pdtr(k, rate), special.pdtrc(k, rate)
 
     def _log_p(self, k):
-        return k * jnp.log(self.rate) - self.rate - lgamma(k + 1)
+        return log_power(self.rate, k) - self.rate - lgamma(k + 1)
 
     def log_tails(self, k: int) -> tuple[Array, Array]:
-        return jnp.log(gammaincc(k + 1, self.rate)), jnp.log(gammainc(k + 1, self.rate))
+        none, up_to = k < 0, jnp.maximum(k, 0) + 1
+        below = jnp.where(none, -jnp.inf, jnp.log(gammaincc(up_to, self.rate)))
+        return below, jnp.where(none, 0.0, jnp.log(gammainc(up_to, self.rate)))
 
     def mean(self) -> Any:
         return self.rate
@@ -241,7 +244,7 @@ class Binomial(_Counts):
         n, p = self.total_count, self.probs
         inner = jnp.minimum(k, n)
         ways = lgamma(n + 1) - lgamma(inner + 1) - lgamma(n - inner + 1)
-        log_p = ways + inner * jnp.log(p) + (n - inner) * jnp.log1p(-p)
+        log_p = ways + log_power(p, inner) + xlog1py(n - inner, -p)
         return jnp.where(k > n, -jnp.inf, log_p)
 
     def log_tails(self, k: int) -> tuple[Array, Array]:

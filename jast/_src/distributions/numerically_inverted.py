@@ -22,7 +22,7 @@ from jast._src.distributions.family_table import register, register_both
 from jast._src.distributions.log_tail_rows import log_tails_of, of_inverse
 from jast._src.distributions.normal import Symmetric
 from jast._src.distributions.normal_tails import HALF_LOG_2PI, log_tails, normal_of_log_tails
-from jast._src.distributions.operations import from_normal
+from jast._src.distributions.operations import from_normal, no_quantile
 from jast._src.distributions.tables import interpolated, numbers, serves, tail
 
 __all__ = ["MixtureSameFamily", "StudentT", "newton"]
@@ -256,6 +256,8 @@ def _score_mixture(d, x):
 
 def _mixture(d, z):
     parts = d.components_distribution
+    if not jnp.issubdtype(parts.dtype, jnp.floating):  # Newton's rule comes between whole numbers
+        raise no_quantile(d)
     ends = stop_gradient(from_normal(parts, jnp.broadcast_to(z[..., None], parts.batch_shape)))
     guess = jnp.sum(ends * jnp.exp(_log_weights(d)), axis=-1)
     low, high = jnp.min(ends, axis=-1), jnp.max(ends, axis=-1)

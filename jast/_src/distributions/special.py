@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 
 from jast._src.core.typing import Array, DistributionLike, Numeric, PRNGKey
-from jast._src.distributions.base import Distribution
+from jast._src.distributions.base import Distribution, as_key, float_array
 from jast._src.distributions.normal_tails import fraction
 from jast._src.distributions.operations import log_density, mode
 
@@ -129,7 +129,7 @@ class Tent(Distribution):
         low: Numeric = 0.0,
         high: Numeric = 1.0,
     ) -> None:
-        center = jnp.asarray(center)
+        center = float_array(center)
         self._center, self._width, self._low, self._high = (
             jnp.asarray(v, center.dtype) for v in (center, width, low, high)
         )
@@ -214,6 +214,7 @@ class Where(Distribution):
         )
 
     def sample(self, *, seed: PRNGKey | int, sample_shape: int | Sequence[int] = ()) -> Any:
+        seed = as_key(seed)
         # one key serves both, as only one of the two draws is seen; the clone tells JAX's check of
         # reused keys that it is meant
         other = self._b.sample(seed=jax.random.clone(seed), sample_shape=sample_shape)

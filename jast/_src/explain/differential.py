@@ -10,7 +10,7 @@ from jax.tree_util import Partial
 
 from jast import distributions as D
 from jast._src.core.signature import signature_of
-from jast._src.core.simulator import Simulator
+from jast._src.core.simulator import Simulator, require_simulator
 from jast._src.core.typing import Array, PRNGKey
 from jast._src.stress_testing.report import Report
 from jast._src.util.pytrees import select, with_strong_types
@@ -77,8 +77,8 @@ def regression(sim_a: Simulator, sim_b: Simulator) -> Simulator:
 
     The disturbances are those of b's model for as long as b runs, and then of a's. An episode ends
     when b has come to its end without a failure, or a has failed, or both are over. The miss
-    distance is that of b; where both fail it is that of an undisturbed b, as no number tells how
-    far a is from not failing.
+    distance is that of b; where both fail it is that of b's start, as no number tells how far a is
+    from not failing.
 
     Args:
         sim_a: the former version.
@@ -88,7 +88,8 @@ def regression(sim_a: Simulator, sim_b: Simulator) -> Simulator:
         An episodic `jast.Simulator`.
 
     Raises:
-        ValueError: where the disturbances of the two, or of their starts, differ in shape.
+        ValueError: where the disturbances of the two, or of their starts, differ in shape, and for
+            what is no simulator.
 
     Example:
         >>> import jax.numpy as jnp, jast
@@ -98,6 +99,8 @@ def regression(sim_a: Simulator, sim_b: Simulator) -> Simulator:
         >>> bool(jast.replay(both, jnp.concatenate([there, back, jnp.zeros(12)])).failure)
         True
     """
+    for sim in (sim_a, sim_b):
+        require_simulator("regression", sim)
     a, b = signature_of(sim_a), signature_of(sim_b)
     for part, one, other in (("disturbance", a.x, b.x), ("start", a.x0, b.x0)):
         if _shapes(one) != _shapes(other):

@@ -15,6 +15,7 @@ from jast._src.explain.episodes import draw_ordinary, observations
 from jast._src.explain.held_out import hold_out, share_of, sklearn_module
 from jast._src.explain.training_cases import given_cases, simulate_cases
 from jast._src.util import checks, display
+from jast._src.util.intervals import checked_level
 from jast._src.weakness.measures import Roc, roc
 
 __all__ = ["Monitor", "monitor"]
@@ -182,7 +183,7 @@ def monitor(
     if budget is not None:
         budget = checks.whole_number(name, "budget", budget, 1)
     rate = checks.number(name, "false_alarms", false_alarms, lambda v: 0 <= v <= 1, "from 0 to 1")
-    level = checks.number(name, "level", level, lambda v: 0 < v < 1, "between 0 and 1")
+    level = checked_level(name, level)
     if model not in MODELS:
         raise ValueError(f"{name}: model must be one of {sorted(MODELS)}, received {model!r}")
     first, second = jax.random.split(key)

@@ -18,6 +18,7 @@ from jast._src.explain.feature_table import Describer, feature_table, make_descr
 from jast._src.explain.held_out import DISTINCT, hold_out, sklearn_module
 from jast._src.explain.training_cases import given_cases, simulate_cases
 from jast._src.util import checks, display
+from jast._src.util.intervals import checked_level
 
 __all__ = ["Rules", "rules"]
 
@@ -173,7 +174,7 @@ def rules(
     lead = checks.whole_number(name, "lead", lead, 0)
     if budget is not None:
         budget = checks.whole_number(name, "budget", budget, 1)
-    level = checks.number(name, "level", level, lambda v: 0 < v < 1, "between 0 and 1")
+    level = checked_level(name, level)
     if of not in OF:
         raise ValueError(f"{name}: of must be one of {OF}, received {of!r}")
     first, second, third = jax.random.split(key, 3)

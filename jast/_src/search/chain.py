@@ -136,7 +136,7 @@ class _Search:
     def __init__(self, key: jax.Array, sim: Simulator, episodes: int, narrowest: float, top: int):
         self.sim, self.reward, self.top = sim, standard_reward(sim), top
         self.key, self.narrowest = tree_keys(key, 1)[0], narrowest
-        lanes = max(2 * MIN_LEVELS, min(LANES, 1 << max(0, (episodes // 16).bit_length())))
+        lanes = max(2 * MIN_LEVELS, min(LANES, 1 << (episodes // 16).bit_length()))
         # the logarithms of neighbouring widths differ by 2 / sqrt(D), so that they exchange points
         ratios = math.log(WIDEST_WITHOUT / narrowest) * math.sqrt(dimension(sim)) / 2
         self.levels = min(max(math.ceil(ratios) + 1, MIN_LEVELS), MAX_LEVELS, lanes // 2)

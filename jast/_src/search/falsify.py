@@ -190,14 +190,13 @@ class _Search:
 
     def result(self, state: State, log: Log, settings: dict[str, Any]) -> SearchResult:
         pool, numbers = state.pool, state.numbers
-        once = np.ones(len(numbers), np.int32)
         nearest = np.concatenate([pool.first[0], pool.rows[0].ravel()])
         u = state.failing if len(numbers) else nearest[None]
         normal = map_in_lanes(LANES, _normal, u.astype(normal_numbers(self.sim)))
         e = played(self.sim, normal)
         failing = jax.tree.map(lambda a: a[: len(numbers)], e)
         nearest = jax.tree.map(lambda a: a[0], e)
-        return finish(self, log, nearest, failing, numbers, counts=once, settings=settings)
+        return finish(self, log, nearest, failing, numbers, settings=settings)
 
 
 @jit

@@ -125,7 +125,7 @@ class _Search:
         z = jax.random.normal(self.draw, (n, dimension(sim)), normal_numbers(sim))
         d = jax.device_get(descents(sim, z))
         failing = self._failing(d.point[np.isfinite(d.point).all(axis=1) & d.found])
-        nearest = played(sim, d.nearest[[np.argmin(d.distance)]])
+        nearest = self._scored(played(sim, d.nearest[[np.argmin(d.distance)]]))
         first = int(d.first.min())
         # side by side, the gradients of a step before its other episodes
         order = first * (GRADIENT * n + n * (EPISODES // STEPS)) + GRADIENT * n
@@ -143,24 +143,24 @@ class _Search:
         return State(failing, nearest, useful), tally, np.array([best]), None
 
     def _failing(self, z: np.ndarray) -> Episode:
-        """The failing episodes of the points ``z`` [n, D], lifted as little as makes them fail;
-        their reward is log p relative to the mode.
-        """
+        """The failing episodes of the points ``z`` [n, D], lifted as little as makes them fail."""
         sim = self.sim
         if len(z):
             e = played(sim, lift(z).reshape(-1, dimension(sim)))
             _, rows = first_failing_lift(e.failure, len(z))
             if len(rows):
-                e = jax.tree.map(lambda a: a[rows], e)
-                return side_by_side(sim, partial(_scored, sim, self.reward), e)
+                return self._scored(jax.tree.map(lambda a: a[rows], e))
         return jax.device_get(blank_episodes(sim, 0))
+
+    def _scored(self, e: Episode) -> Episode:
+        """The episodes with the reward of the search."""
+        return side_by_side(self.sim, partial(_scored, self.sim, self.reward), e)
 
     def result(self, state: State, log: Log, settings: dict[str, Any]) -> SearchResult:
         failing, n = state.failing, len(state.failing.length)
-        once = np.ones(n, np.int32)
         nearest = jax.tree.map(lambda a: a[0], state.nearest)
         settings = settings | dict(useful_gradients=round(float(state.useful), 4))
-        return finish(self, log, nearest, failing, np.arange(n), counts=once, settings=settings)
+        return finish(self, log, nearest, failing, np.arange(n), settings=settings)
 
 
 @jit

@@ -41,13 +41,7 @@ def ruin(up: Numeric = 0.4, start: int = 1, goal: int = 30, horizon: int = 371) 
         >>> bool(jast.replay(sim, jnp.ones(4, jnp.int32)).failure)
         True
     """
-    up = _probability("ruin", up)
-    start, goal = (
-        v if is_traced(v) else whole_number("ruin", name, v)
-        for name, v in (("start", start), ("goal", goal))
-    )
-    if not is_traced(start) and not is_traced(goal) and goal <= start:
-        raise ValueError(f"ruin: goal must be above start = {start}, received {goal}")
+    up, start, goal = _checked("ruin", up, start, goal)
     start, goal = jnp.asarray(start, jnp.int32), jnp.asarray(goal, jnp.int32)
     return Simulator(
         init=Partial(_init, start),
@@ -69,12 +63,15 @@ def ruin_probability(
         up, start, goal: as for `ruin`.
         horizon: steps, or None for a game without end.
 
+    Raises:
+        ValueError: as `ruin`.
+
     Example:
         >>> import jast
         >>> round(float(jast.simulators.ruin_probability(0.5, 1, 4)), 6)
         0.25
     """
-    up = _probability("ruin_probability", up)
+    up, start, goal = _checked("ruin_probability", up, start, goal)
     if horizon is None:
         log_r = jnp.log1p(-up) - jnp.log(up)
         fair = log_r == 0
@@ -99,9 +96,15 @@ def ruin_probability(
     return lax.fori_loop(0, horizon, step, (mass, jnp.zeros((), up.dtype)))[1]
 
 
-def _probability(function, up):
+def _checked(function, up, start, goal):
     up = real_number(function, "up", up, lambda p: 0 < p < 1, "between 0 and 1")
-    return up.astype(up.dtype)  # no longer weakly typed
+    start, goal = (
+        v if is_traced(v) else whole_number(function, name, v)
+        for name, v in (("start", start), ("goal", goal))
+    )
+    if not is_traced(start) and not is_traced(goal) and goal <= start:
+        raise ValueError(f"{function}: goal must be above start = {start}, received {goal}")
+    return up.astype(up.dtype), start, goal  # no longer weakly typed
 
 
 def _init(start, x0):

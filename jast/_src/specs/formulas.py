@@ -25,6 +25,7 @@ __all__ = [
     "Temporal",
     "Until",
     "always",
+    "checked_formula",
     "children",
     "eventually",
     "implies",
@@ -244,7 +245,7 @@ def until(f: Formula, g: Formula, a: float = 0.0, b: float | None = None) -> For
         >>> print(float(specs.robustness(rule, jnp.array([1.0, 4.0, 2.0]), 1.0)))
         1.0
     """
-    f, g = _checked_formula("until", "f", f), _checked_formula("until", "g", g)
+    f, g = checked_formula("until", "f", f), checked_formula("until", "g", g)
     return Until(f, g, *_checked_window("until", g, a, b))
 
 
@@ -269,7 +270,7 @@ def implies(f: Formula, g: Formula) -> Formula:
         >>> print(float(specs.robustness(rule, jnp.array([1.0, 4.0, 2.0]), 1.0)))
         1.0
     """
-    return Implies(_checked_formula("implies", "f", f), _checked_formula("implies", "g", g))
+    return Implies(checked_formula("implies", "f", f), checked_formula("implies", "g", g))
 
 
 def children(f: Formula) -> tuple[Formula, ...]:
@@ -297,12 +298,12 @@ def window(f: Temporal | Until) -> str:
 
 
 def _temporal(kind: str, f: Formula, a: Any, b: Any) -> Formula:
-    return Temporal(_checked_formula(kind, "f", f), kind, *_checked_window(kind, f, a, b))
+    return Temporal(checked_formula(kind, "f", f), kind, *_checked_window(kind, f, a, b))
 
 
 def _junction(kind: str, *parts: Formula) -> Formula:
     for part in parts:
-        _checked_formula(kind, "each side", part)
+        checked_formula(kind, "each side", part)
     flat = [p.parts if isinstance(p, Junction) and p.kind == kind else (p,) for p in parts]
     return Junction(sum(flat, ()), kind)
 
@@ -313,7 +314,8 @@ def _in_brackets(f: Formula) -> str:
     return text if alone else f"({text})"
 
 
-def _checked_formula(function: str, name: str, f: Any) -> Formula:
+def checked_formula(function: str, name: str, f: Any) -> Formula:
+    """``f``. ValueError unless it is a formula."""
     if not isinstance(f, Formula):
         raise ValueError(
             f"{function}: {name} must be a formula, as jast.specs.predicate(function) makes it,"

@@ -28,6 +28,7 @@ from jast._src.specs.formulas import (
     Predicate,
     Temporal,
     Until,
+    checked_formula,
     children,
     predicates,
 )
@@ -87,6 +88,7 @@ def robustness(
         >>> slope.tolist()  # the sample that decides
         [-0.0, -1.0, -0.0]
     """
+    checked_formula("robustness", "formula", formula)
     dt, length = spacing("robustness", dt), _length(trace)
     if temperature is not None:
         temperature = real_number(
@@ -223,10 +225,7 @@ def samples_in(function: str, f: Temporal | Until, dt: float) -> tuple[int, int 
 
 def spacing(function: str, dt: Any) -> float:
     """``dt`` as a Python float."""
-    expected = "of seconds above 0"
-    if is_traced(dt):
-        raise ValueError(f"{function}: dt must be a number {expected}, received {dt!r}")
-    return number(function, "dt", dt, lambda v: 0 < v < math.inf, expected)
+    return number(function, "dt", dt, lambda v: 0 < v < math.inf, "of seconds above 0")
 
 
 def _length(trace: Any) -> int:

@@ -15,7 +15,7 @@ from jast._src.core.episode import Episode
 from jast._src.core.signature import signature_of
 from jast._src.core.simulator import Simulator
 from jast._src.specs import monitor
-from jast._src.specs.formulas import Formula, predicates
+from jast._src.specs.formulas import Formula, checked_formula, predicates
 from jast._src.specs.robustness import fits, margins, spacing
 from jast._src.util.pytrees import as_partial
 
@@ -113,8 +113,7 @@ def under(
         >>> bool(jast.replay(sim, jnp.ones(30)).failure)
         True
     """
-    if not isinstance(formula, Formula):
-        raise ValueError(f"under: formula must be a jast.specs formula, received {formula!r}")
+    checked_formula("under", "formula", formula)
     if samples is not None and not callable(samples):
         raise ValueError(f"under: samples must be a function of the state, received {samples!r}")
     contract("under", sim)

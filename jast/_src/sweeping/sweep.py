@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence, Set
 from typing import Any
 
 import jax
@@ -173,7 +173,8 @@ def _rows(values):
         )
     columns = {}
     for name, given in values.items():
-        if isinstance(given, str) or not isinstance(given, Iterable) or np.ndim(given) == 0:
+        single = isinstance(given, str | Mapping | Set) or not hasattr(given, "__len__")
+        if single or getattr(given, "ndim", 1) == 0:
             raise ValueError(f"sweep: {name} must be a sequence of values, received {given!r}")
         columns[name] = tuple(v.item() if _scalar(v) else v for v in given)
     sizes = {name: len(column) for name, column in columns.items()}

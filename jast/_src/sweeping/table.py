@@ -14,7 +14,7 @@ from jast._src.core.nominal import Nominal
 from jast._src.estimate.estimate import guaranteed_words, is_doubtful
 from jast._src.io.data_frames import dataframe
 from jast._src.util import display
-from jast._src.util.checks import number
+from jast._src.util.intervals import checked_level
 from jast.estimate import Estimate
 from jast.search import SearchResult
 from jast.stress_testing import Report
@@ -152,7 +152,7 @@ class Sweep(NamedTuple):
             ValueError: where the rows do not cross it, or cross it in several places which their
                 intervals tell apart; for a level outside (0, 1), and without a setting of numbers.
         """
-        level = number("crossing", "level", level, lambda v: 0 < v < 1, "between 0 and 1")
+        level = checked_level("crossing", level)
         name, x = self.axis("crossing", against)
         p, (low, high) = self.probability, self.interval.T
         used = np.isfinite(x) & (p > 0) & (self.reliable | unreliable)

@@ -141,7 +141,7 @@ def go_explore(
     given = dict(episodes=episodes, length=length, backward=backward)
     settings = with_refine_share(name, refine, sim, call_settings(name, key, **given), SHARE)
     most = HOSTED_LANES if runs_on_host(sim) else LANES
-    lanes = max(8, min(most, 1 << max(0, (episodes // 16).bit_length())))
+    lanes = max(8, min(most, 1 << (episodes // 16).bit_length()))
     slots = min(SLOTS, max(64, 4 * episodes))
     # twice: with those that enter
     needed = 2 * memory.size(jax.eval_shape(partial(empty_cells, sim, slots)))

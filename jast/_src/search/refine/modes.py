@@ -143,6 +143,9 @@ def modes(
         `Modes`. A further failure that has no path to any of ``likeliest`` counts for the mode
         whose likeliest failure it points most nearly to. Each share is of the members.
 
+    Raises:
+        ValueError: for what is no archive of failures.
+
     Example:
         >>> import jax, jast
         >>> key, sim = jax.random.key(0), jast.simulators.walk1d()
@@ -151,6 +154,12 @@ def modes(
         >>> len(ways)  # upwards and downwards
         2
     """
+    for name, given in (("likeliest", likeliest), ("others", others)):
+        if not isinstance(given, Failures) and not (given is None and name == "others"):
+            raise ValueError(
+                f"modes: {name} must be an archive of jast.failures, as the failures of a result,"
+                f" received {type(given).__name__}"
+            )
     n = len(likeliest)
     if not n:
         return Modes()
