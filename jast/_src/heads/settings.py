@@ -4,7 +4,9 @@ that work, each by its name.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
+from numbers import Real
 from typing import Any, Literal, NamedTuple
 
 __all__ = ["MODES", "HeadSettings", "check_settings", "settings"]
@@ -122,6 +124,10 @@ def _whole(value: Any, least: int) -> bool:
     return isinstance(value, int) and not isinstance(value, bool) and value >= least
 
 
+def _number(value: Any, low: float, high: float = math.inf) -> bool:
+    return isinstance(value, Real) and low <= value <= high
+
+
 def _pair(value: Any, holds: Callable[[Any], bool]) -> bool:
     return isinstance(value, tuple | list) and len(value) == 2 and all(map(holds, value))
 
@@ -137,15 +143,25 @@ RULES = {name: (allowed.__contains__, f"one of {allowed}") for name, allowed in 
 RULES |= dict(
     round=(lambda v: v is None or _whole(v, 1), "None or an integer of at least 1"),
     bins=(lambda v: _whole(v, 2), "an integer of at least 2"),
-    learning_rate=(lambda v: _pair(v, lambda r: r > 0), "a pair of numbers above 0"),
+    hidden=(
+        lambda v: isinstance(v, tuple | list) and all(_whole(n, 1) for n in v),
+        "integers of at least 1",
+    ),
+    learning_rate=(
+        lambda v: _pair(v, lambda r: _number(r, 0) and r > 0),
+        "a pair of numbers above 0",
+    ),
     batch=(lambda v: _pair(v, lambda n: _whole(n, 1)), "a pair of integers of at least 1"),
     steps=(
         lambda v: _pair(v, lambda n: n is None or _whole(n, 0)),
         "a pair of integers of at least 0, or None",
     ),
     replay=(lambda v: _pair(v, lambda n: _whole(n, 0)), "a pair of integers of at least 0"),
-    elite=(lambda v: 0 < v <= 1, "above 0 and at most 1"),
-    power=(lambda v: v >= 0, "at least 0"),
+    elite=(lambda v: _number(v, 0, 1) and v > 0, "above 0 and at most 1"),
+    power=(lambda v: _number(v, 0), "at least 0"),
+    share=(lambda v: _number(v, 0, 1), "from 0 to 1"),
+    q_weight=(lambda v: _number(v, -math.inf), "a number"),
+    v_weight=(lambda v: _number(v, -math.inf), "a number"),
 )
 """Setting -> (what holds for it, in words)."""
 
