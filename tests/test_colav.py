@@ -643,7 +643,6 @@ def test_masses_are_positive_and_damping_dissipates():
         for k, c in enumerate((vessels.LINEAR, vessels.QUADRATIC, vessels.CUBIC))
     )
     assert ((drag * nu).sum(1)[nu.any(1)] > 0).all()
-    assert np.asarray(vessels.energy(Velocity(*nu.T))) == pytest.approx(energy(nu))
 
 
 def test_energy_never_grows_without_thrust(x64, no_thrust):

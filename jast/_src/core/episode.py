@@ -5,11 +5,12 @@ What an episode is stands in `core.transition`; here whole ones are played and r
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 
 from jast import distributions as D
@@ -25,7 +26,7 @@ from jast._src.util import display
 from jast._src.util.checks import check_random_key
 from jast._src.util.pytrees import conform, pad_rows, select, zero_where
 
-__all__ = ["Episode", "play_back", "play_chosen", "replay", "rollout"]
+__all__ = ["Episode", "play_back", "play_chosen", "replay", "rollout", "stacked"]
 
 
 @display.printable()
@@ -180,6 +181,12 @@ def replay(
     disturbances = conform("replay: disturbances", disturbances, rows)
     steps = jnp.asarray(steps if length is None else length, jnp.int32)
     return play_back(sim, rewards.as_pytree(reward), x0, pad_rows(disturbances, sim.horizon), steps)
+
+
+def stacked(episodes: Iterable[Episode]) -> Episode:
+    """Single episodes as a batch [n], on the host and without states."""
+    each = [e._replace(states=None) for e in episodes]
+    return jax.tree.map(lambda *a: np.stack([np.asarray(b) for b in a]), *each)
 
 
 @quick

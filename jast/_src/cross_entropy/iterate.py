@@ -146,7 +146,7 @@ def tell(plan, settings, state, x, value):
     elites = _elites(*pool, kept, max(plan.elites))
     proposal, pending = state.proposal, state.pending
     if plan.method == "ce_method":
-        proposal = refit_to_elites(proposal, elites)
+        proposal = gaussian.fit(proposal, *elites)  # Algorithm 1
     else:
         since = _at([begins[max(0, i + 1 - plan.memory)] for i in range(len(plan.counts))], k)
         seen = _surrogate_data(plan, state, since, at + count)
@@ -264,13 +264,6 @@ def moments(proposal):
     return Gaussian(mean, within + jnp.einsum("k,kd,ke->de", w, z, z))
 
 
-def refit_to_elites(proposal, elites):
-    """Algorithm 1: the `Gaussian` of greatest likelihood for the elites, the old one where they are
-    too few for a covariance.
-    """
-    return gaussian.fit(proposal, elites.x, elites.weights)
-
-
 class ModelSearch(NamedTuple):
     """The outcome of short searches on the surrogate, one an elite."""
 
@@ -334,7 +327,7 @@ def refit_with_surrogate(key, plan, settings, proposal, first, elites, seen, cho
     everything = jax.tree.map(lambda *a: jnp.concatenate(a), elites, model_elites, found)
     best = jnp.argsort(jnp.where(elites.weights > 0, sub.value, jnp.inf))
     if isinstance(proposal, Gaussian):
-        return refit_to_elites(proposal, everything), sub.x[best], judged
+        return gaussian.fit(proposal, *everything), sub.x[best], judged
     new = _refit_mixture(plan, settings, proposal, elites, sub, spread, everything)
     return new, sub.x[best], judged
 

@@ -14,7 +14,6 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jax.tree_util import Partial
 
-from jast import distributions as D
 from jast._src.core import failures
 from jast._src.core.actions import Quantiles, UniformBox, quantiles
 from jast._src.core.check import contract
@@ -26,6 +25,7 @@ from jast._src.core.simulator import Simulator
 from jast._src.core.typing import Actions, Objective, Reward
 from jast._src.cross_entropy.gaussian import Gaussian, normal
 from jast._src.cross_entropy.result import CEResult
+from jast._src.distributions.flat_rows import filled
 from jast._src.normal_space.sequences import latent_policy
 
 __all__ = ["Stress", "over"]
@@ -194,8 +194,4 @@ def _flat(sim: Simulator) -> tuple[jax.Array, Callable[[jax.Array], Any]]:
     latents (of x0, of x [horizon, ...]).
     """
     signature = signature_of(sim)
-
-    def zeros(like, *rows):
-        return jax.tree.map(lambda s: jnp.zeros((*rows, *s.shape), D.float_dtype(s.dtype)), like)
-
-    return ravel_pytree((zeros(signature.x0), zeros(signature.x, sim.horizon)))
+    return ravel_pytree((filled(signature.x0, 0), filled(signature.x, 0, sim.horizon)))

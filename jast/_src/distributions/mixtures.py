@@ -11,12 +11,12 @@ from jast._src.distributions.operations import event_like, from_normal, mode, sa
 from jast._src.distributions.tilted import tilted
 from jast._src.util.pytrees import select
 
-__all__ = ["Blended", "Moved", "blend", "x_of"]
+__all__ = ["Blended", "Moved", "OneByOne", "blend", "x_of"]
 
 COIN = 0x5EED  # what the key of the coin is folded with
 
 
-class _Mixture(Distribution):
+class OneByOne(Distribution):
     """Drawn one at a time, by ``_draw(key)``."""
 
     def sample(self, *, seed, sample_shape=()):
@@ -29,7 +29,7 @@ class _Mixture(Distribution):
         return self._draw(seed)
 
 
-class Blend(_Mixture):
+class Blend(OneByOne):
     """What `blend` makes."""
 
     def __init__(self, log_weights, parts):
@@ -98,7 +98,7 @@ class Moved(Wrapped):
         return x_of(self._model, self._mean)
 
 
-class Blended(_Mixture):
+class Blended(OneByOne):
     """sum_k weights[k] (``dist`` with z ~ N(means[k], deviations[k]^2)); ``weights`` [K] of sum 1,
     ``means`` and ``deviations`` [K, n].
     """

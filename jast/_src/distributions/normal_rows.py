@@ -3,6 +3,7 @@ families are in `distrax_rows`. Each serves distrax's class of that name, too.
 """
 
 from collections.abc import Callable
+from operator import attrgetter
 from typing import Any
 
 import jax.numpy as jnp
@@ -14,23 +15,20 @@ from jast._src.distributions.family_table import register, register_both
 from jast._src.distributions.normal_tails import inside, ndtr, ndtri, standard
 from jast._src.distributions.tilted import tilted
 
-register_both(
-    normal.Normal,
-    quantile=lambda d, u: d.loc + d.scale * ndtri(inside(u)),
-    cdf=lambda d, x: ndtr(standard(x - d.loc, d.scale)),
-    from_normal=lambda d, z: d.loc + d.scale * z,
-    to_normal=lambda d, x: (x - d.loc) / d.scale,
-    tilt=lambda d, m, s: normal.Normal(d.loc + d.scale * m, d.scale * s),
-)
 
-register_both(
-    normal.MultivariateNormalDiag,
-    quantile=lambda d, u: d.loc + d.scale_diag * ndtri(inside(u)),
-    cdf=lambda d, x: ndtr(standard(x - d.loc, d.scale_diag)),
-    from_normal=lambda d, z: d.loc + d.scale_diag * z,
-    to_normal=lambda d, x: (x - d.loc) / d.scale_diag,
-    tilt=lambda d, m, s: normal.MultivariateNormalDiag(d.loc + d.scale_diag * m, d.scale_diag * s),
-)
+def _number_by_number(kind: Any, scale: Callable[[Any], Any]) -> dict[str, Callable[..., Any]]:
+    """The functions of a row of numbers that are each scaled by themselves."""
+    return dict(
+        quantile=lambda d, u: d.loc + scale(d) * ndtri(inside(u)),
+        cdf=lambda d, x: ndtr(standard(x - d.loc, scale(d))),
+        from_normal=lambda d, z: d.loc + scale(d) * z,
+        to_normal=lambda d, x: (x - d.loc) / scale(d),
+        tilt=lambda d, m, s: kind(d.loc + scale(d) * m, scale(d) * s),
+    )
+
+
+for kind, name in ((normal.Normal, "scale"), (normal.MultivariateNormalDiag, "scale_diag")):
+    register_both(kind, **_number_by_number(kind, attrgetter(name)))
 
 
 def _cdf_tri(d, x):

@@ -214,7 +214,7 @@ class TruncatedNormal(LocationScale):
 
     def _sample_n(self, key: PRNGKey, n: int) -> Any:
         z = jax.random.normal(key, **self._like_n(n))
-        return jax.vmap(lambda z: _cut(self, z))(z)
+        return jax.vmap(lambda z: _cut(self, *log_tails(z)))(z)
 
     def log_prob(self, value: Any) -> Array:
         exponent = -0.5 * jnp.square(self._standardize(value))
@@ -225,9 +225,8 @@ class TruncatedNormal(LocationScale):
         return jnp.clip(self.loc, self.low, self.high)
 
 
-def _cut(d, z, tails=None):
+def _cut(d, below, above):
     a, b, log_mass = d.ends()
-    below, above = log_tails(z) if tails is None else tails
     e = normal_of_log_tails(
         jnp.logaddexp(log_tails(a)[0], log_mass + below),
         jnp.logaddexp(log_tails(b)[1], log_mass + above),
@@ -261,5 +260,5 @@ def _tails_cut(d, x):
 
 register(
     TruncatedNormal,
-    **of_log_tails(lambda d, below, above: _cut(d, None, (below, above)), _tails_cut),
+    **of_log_tails(_cut, _tails_cut),
 )

@@ -44,9 +44,6 @@ class Fixed(_WithoutDensity):
     ) -> Any:
         return ()
 
-    def _sample_n(self, key: PRNGKey, n: int) -> Any:
-        return ()
-
     def mode(self) -> Any:
         return ()
 

@@ -13,7 +13,7 @@ from jax.tree_util import Partial
 
 from jast import distributions as D
 from jast._src.core import rewards
-from jast._src.core.episode import Episode, play_back, rollout
+from jast._src.core.episode import Episode, play_back, rollout, stacked
 from jast._src.core.failures import Failures, identity
 from jast._src.core.signature import signature_of
 from jast._src.core.simulator import Simulator
@@ -69,8 +69,7 @@ def gather_episodes(function: str, argument: str, sim: Simulator, given: Any) ->
             raise refusal
         if not each:
             raise ValueError(f"{function}: {argument} must hold episodes, received none")
-        bare = [jax.device_get(part._replace(states=None)) for part in each]
-        e = jax.tree.map(lambda *a: np.stack([np.asarray(one) for one in a]), *bare)
+        e = stacked(each)
     if not isinstance(e, Episode):
         raise refusal
     e = jax.tree.map(np.asarray, jax.device_get(e._replace(states=None)))

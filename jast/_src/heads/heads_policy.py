@@ -14,40 +14,31 @@ from jast._src.core.signature import signature_of
 from jast._src.core.simulator import Simulator
 from jast._src.core.typing import Actions, Numeric
 from jast._src.distributions.flat_rows import flat, unflat
+from jast._src.distributions.mixtures import OneByOne
 from jast._src.heads.heads import Heads, observation, policy_logits, sample_bins
 from jast._src.heads.samples import cells
 
 __all__ = ["as_policy"]
 
 
-class Histogram(D.Distribution):
+class Histogram(OneByOne):
     """Disturbances whose points in the unit cube (`jast.actions`) have a density constant in each
     of equal cells: ``logits`` [d, bins].
     """
 
     def __init__(self, logits, actions, dist):
-        super().__init__()
         self._logits, self._actions, self._dist = logits, actions, dist
 
     @property
     def event_shape(self):
         return jax.tree.map(lambda s: s.shape, D.event_like(self._dist))
 
-    def sample(self, *, seed, sample_shape=()):
-        """One disturbance; ``sample_shape`` must be ()."""
-        if sample_shape != ():
-            raise ValueError(
-                f"Histogram: sample_shape must be (), received {sample_shape!r}: use jax.vmap over"
-                " keys"
-            )
-        u = sample_bins(self._logits, jax.random.uniform(seed, self._logits.shape[:1], jnp.float32))
+    def _draw(self, key):
+        u = sample_bins(self._logits, jax.random.uniform(key, self._logits.shape[:1], jnp.float32))
         event = D.event_like(self._dist)
         return jax.tree.map(
             lambda a, s: a.astype(s.dtype), self._actions.at(unflat(u, event), self._dist), event
         )
-
-    def _sample_n(self, key, n):
-        return jax.vmap(lambda k: self.sample(seed=k))(jax.random.split(key, n))
 
     def log_prob(self, value):
         """Log density; floating disturbances only, since a cell need not hold whole integers."""

@@ -6,10 +6,9 @@ import io
 import textwrap
 from typing import TYPE_CHECKING, Any
 
-import jax
 import numpy as np
 
-from jast._src.core.episode import Episode
+from jast._src.core.episode import Episode, stacked
 from jast._src.core.signature import signature_of
 from jast._src.core.simulator import Simulator
 from jast._src.io.codec import name_of
@@ -232,12 +231,10 @@ def _failures(report: Any, sim: Any, shown: list) -> tuple[Episode, np.ndarray]:
     a call of a black box; and the mode of each.
     """
     more = report.failures[: 64 if series.replays_without_calls(sim) else 0]
-    each = [e._replace(states=None) for e in (*shown, *more)]
     others = np.zeros(len(more), int)
     if report.modes and len(more):
         others = series.samples_of("report", more, sim, report.modes, 64).mode
-    episodes = jax.tree.map(lambda *a: np.stack([np.asarray(b) for b in a]), *each)
-    return episodes, np.concatenate([np.arange(len(shown)), others])
+    return stacked((*shown, *more)), np.concatenate([np.arange(len(shown)), others])
 
 
 def _draw_traces(

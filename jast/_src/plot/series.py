@@ -8,7 +8,7 @@ import jax
 import numpy as np
 
 from jast._src.blackbox.simulator import Record, Standing
-from jast._src.core.episode import Episode, replay, rollout
+from jast._src.core.episode import Episode, replay, rollout, stacked
 from jast._src.core.failures import Failures
 from jast._src.core.policy import undisturbed
 from jast._src.core.signature import signature_of
@@ -87,7 +87,7 @@ def samples_of(caller: str, samples: Any, sim: Any, modes: Any, most: int) -> Sa
         samples = Modes([samples])
     if isinstance(samples, Modes) and len(samples):
         modes = np.arange(len(samples)) if modes is None else modes
-        samples = _likeliest(samples)
+        samples = stacked(m.failure for m in samples)
     if isinstance(samples, SearchResult | FailureSamples):
         samples = samples.failures
     samples = samples.episodes if isinstance(samples, Failures) else samples
@@ -107,7 +107,8 @@ def samples_of(caller: str, samples: Any, sim: Any, modes: Any, most: int) -> Sa
     if modes is None or (isinstance(modes, Modes) and not len(modes)):
         return Samples(few, sim, None)
     if isinstance(modes, Modes):
-        return Samples(few, sim, owners(sim, few._replace(states=None), _likeliest(modes)))
+        likeliest = stacked(m.failure for m in modes)
+        return Samples(few, sim, owners(sim, few._replace(states=None), likeliest))
     numbers = np.asarray(modes)
     if numbers.shape != (n,) or numbers.dtype.kind not in "iu" or numbers.min() < 0:
         raise ValueError(
@@ -115,12 +116,6 @@ def samples_of(caller: str, samples: Any, sim: Any, modes: Any, most: int) -> Sa
             f" each of {n} episodes, received {modes!r}"
         )
     return Samples(few, sim, numbers[rows])
-
-
-def _likeliest(modes: Modes) -> Episode:
-    """The likeliest failure of each mode, as a batch without states."""
-    each = [m.failure._replace(states=None) for m in modes]
-    return jax.tree.map(lambda *a: np.stack([np.asarray(b) for b in a]), *each)
 
 
 def by_mode(g: Samples) -> list[tuple[np.ndarray, str, str, str]]:

@@ -7,6 +7,7 @@ import jax
 import numpy as np
 
 from jast._src.core.counter_prng import numpy_generator
+from jast._src.core.episode import stacked
 from jast._src.core.simulator import Simulator
 from jast._src.estimate.population.failure_sample import Sample
 from jast._src.estimate.proposal_search.mixture_draws import resample
@@ -70,8 +71,7 @@ def mode_shares(
     def place(e):
         return transform.normal_of(of_modes, e).astype(np.float64), np.asarray(e.length)
 
-    bests = [m.failure._replace(states=None) for m in modes]
-    targets = place(jax.tree.map(lambda *a: np.stack([np.asarray(b) for b in a]), *bests))
+    targets = place(stacked(m.failure for m in modes))
     points, ends = place(transform.played(sim, z))
     step = len(z) // MAX_PATH_FAILURES
     some = np.arange(step // 2, len(z), step)

@@ -11,7 +11,7 @@ import jax
 import numpy as np
 
 from jast._src.core.check import check
-from jast._src.core.episode import rollout
+from jast._src.core.episode import rollout, stacked
 from jast._src.core.failures import Failures, collect, empty, merge
 from jast._src.core.nominal import BRIEF, nominal
 from jast._src.core.rewards import likelihood
@@ -345,9 +345,7 @@ class _StressTest:
 
     def collect(self, episodes):
         """The `Failures` of single episodes."""
-        each = [e._replace(states=None) for e in episodes]
-        stacked = jax.tree.map(lambda *a: np.stack([np.asarray(b) for b in a]), *each)
-        return collect(self.sim, self.reward, stacked)
+        return collect(self.sim, self.reward, stacked(episodes))
 
     def run_populations(self):
         """The probability by populations."""

@@ -8,6 +8,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jast._src.heads.networks import adam, adam_step
+
 __all__ = ["failure_gradient", "fit", "folds", "held_out_probability"]
 
 HIDDEN = 32  # units of a member's one hidden layer; a convention
@@ -113,21 +115,18 @@ def failure_gradient(committee, x, labels):
 
 @jax.jit
 def _fit(start, x, targets, weights, order):
-    import optax
+    steps, batch = order.shape
 
-    # optax asks for it
-    with jax.numpy_rank_promotion("allow"), jax.numpy_dtype_promotion("standard"):
-        steps, batch = order.shape
-        adam = optax.adam(lambda i: RATE * (1 - i / steps))
+    def loss(committee, rows):
+        out = jax.nn.log_softmax(logits(committee, x[rows]))
+        said = jnp.take_along_axis(out, targets[rows][:, None, None], axis=2)[..., 0]
+        return -jnp.sum(weights[:, rows].T * said) / batch
 
-        def loss(committee, rows):
-            out = jax.nn.log_softmax(logits(committee, x[rows]))
-            said = jnp.take_along_axis(out, targets[rows][:, None, None], axis=2)[..., 0]
-            return -jnp.sum(weights[:, rows].T * said) / batch
+    def step(carry, at):
+        i, rows = at
+        slope = jax.grad(loss)(carry[0], rows)
+        return adam_step(*carry, slope, RATE * (1 - i / steps)), None
 
-        def step(carry, rows):
-            committee, state = carry
-            update, state = adam.update(jax.grad(loss)(committee, rows), state)
-            return (optax.apply_updates(committee, update), state), None
-
-        return jax.lax.scan(step, (start, adam.init(start)), order)[0][0]
+    rounds = jnp.arange(steps, dtype=jnp.int32), order
+    with jax.numpy_rank_promotion("allow"):  # optax asks for it
+        return jax.lax.scan(step, (start, adam().init(start)), rounds)[0][0]

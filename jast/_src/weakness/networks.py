@@ -95,11 +95,12 @@ def fit_autoencoder(key, rows, hidden, *, epochs=20, batch=1000, rate=1e-3):
     return _fit(then, network.init(first), data, network.apply, **how)
 
 
+@functools.partial(jax.jit, static_argnames="hidden")
 def codes_of(params, rows, hidden):
     """The codes [n, hidden[-1]] of ``rows`` [n, d] by an autoencoder that `fit_autoencoder`
     trained.
     """
-    return _codes(autoencoder(rows.shape[1], hidden).encode, params, rows)
+    return autoencoder(rows.shape[1], hidden).encode(params, rows)
 
 
 def fit_adversary(key, params, codes, failed, number, size, *, epochs=20, batch=1, rate=3e-5):
@@ -118,11 +119,6 @@ def fit_adversary(key, params, codes, failed, number, size, *, epochs=20, batch=
 def logits(params, codes):
     """The adversary's logits [n] of ``codes`` [n, d]."""
     return adversary(codes.shape[1]).apply(params, codes)
-
-
-@jax.jit
-def _codes(encode, params, rows):
-    return encode(params, rows)
 
 
 def _squared(out, target):

@@ -23,7 +23,6 @@ __all__ = [
     "Pose",
     "Velocity",
     "adversary_substep",
-    "energy",
     "ferry_substep",
     "world_velocity",
 ]
@@ -90,11 +89,6 @@ def world_velocity(pose, velocity):
     """(north, east) velocity, m/s."""
     rate = pose_rate(pose, velocity)
     return rate.n, rate.e
-
-
-def energy(velocity):
-    """Kinetic energy of the ferry and the water that moves with it, J."""
-    return 0.5 * sum(m * x**2 for m, x in zip(MASS, velocity, strict=True))
 
 
 def forces(control, pose, velocity):
