@@ -302,7 +302,7 @@ def _log_ratios_along(q, z, used):
         m = used[i : i + rows]
         part = np.where(np.arange(d) < m[:, None], z[i : i + rows], 0).astype(np.float64)
         gap, wider = product(part, ways.T) - along[m], (variances - 1) * size[m]
-        # determinant and inverse of 1 + a rank: 1 + wider, and I - (variance - 1) a a^T / that
+        # its determinant is 1 + wider, its inverse I - (variance - 1) a a^T / (1 + wider)
         bend = (variances - 1) * gap**2 / (1 + wider) - np.log1p(wider)
         out[i : i + rows, :live] = product(part, means.T) - 0.5 * squares[m] + 0.5 * bend
     return out
