@@ -179,6 +179,11 @@ def test_pareto_k_is_that_of_psis(n):
         assert pareto_k(log_w, n) == pytest.approx(psis_k(log_w, n), rel=1e-6, abs=1e-6)
 
 
+def test_an_infinite_weight_has_no_finite_shape():
+    log_w = np.random.default_rng(0).normal(size=1000)
+    assert pareto_k(np.append(log_w, np.inf), 1001) == np.inf
+
+
 @pytest.mark.parametrize("k", [-0.4, 0.1, 0.5, 0.7, 1.2])
 def test_pareto_k_of_known_tails(k):
     """Generalised Pareto weights of shape k, 40,000 a draw (the tail: m = 600): the mean over 40

@@ -2,6 +2,8 @@
 is made of, and failures as they would happen.
 """
 
+import importlib
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -320,6 +322,19 @@ def test_adaptive_cross_entropy(key):
     assert found.samples == BUDGET * 4 // 5
 
 
+@pytest.mark.slow
+def test_an_interrupted_cross_entropy_counts_what_it_ran(key, monkeypatch):
+    def stop(*_):
+        raise KeyboardInterrupt
+
+    importance = partial(jast.estimate.importance, callback=stop)
+    module = importlib.import_module(adaptive_cross_entropy.__module__)
+    monkeypatch.setattr(module, "importance", importance)
+    found = adaptive_cross_entropy(key, planes(3.5), BUDGET)
+    assert found.warnings[0].startswith("interrupted after")
+    assert found.episodes == found.samples + BUDGET // 5 < BUDGET
+
+
 def _gamma(s):
     return D.VonMises(jnp.asarray(2.0), jnp.asarray(1.0))
 
@@ -361,6 +376,10 @@ def test_no_quantile_function(key, method):
         (
             lambda key: failure_probability(key, planes(), level=1.0),
             "failure_probability: level must .*received 1.0",
+        ),
+        (
+            lambda key: failure_probability(key, planes(), failures=[jax.random.key(0)]),
+            "failure_probability: failures must be an archive of jast.failures, .* received list",
         ),
         (
             lambda key: adaptive_cross_entropy(key, planes(), 10),

@@ -54,7 +54,7 @@ def pareto_k(log_weights: Array, samples: int, failures: int | None = None) -> f
 
     Returns:
         A float; NaN for fewer than 5 weights, and where one is NaN; -inf where the greatest are all
-        equal.
+        equal, and inf where one is infinite.
 
     Example:
         >>> import numpy as np, jast
@@ -65,6 +65,8 @@ def pareto_k(log_weights: Array, samples: int, failures: int | None = None) -> f
     log_w = np.sort(np.asarray(log_weights, np.float64))
     if np.isnan(log_w).any():
         return float("nan")
+    if np.isposinf(log_w).any():
+        return float("inf")
     log_w = log_w[log_w > -np.inf]
     failures = len(log_w) if failures is None else failures
     m = min(tail_size(samples), math.ceil(max(failures / 5, MIN_TAIL)), len(log_w) - 1)

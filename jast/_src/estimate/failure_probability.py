@@ -179,6 +179,11 @@ def failure_probability(
     transform.check(name, sim)
     if near is not None and not isinstance(near, Estimate):
         raise ValueError(f"{name}: near must be an Estimate, received {type(near).__name__}")
+    if failures is not None and not isinstance(failures, Failures):
+        raise ValueError(
+            f"{name}: failures must be an archive of jast.failures, as the failures of a search,"
+            f" received {type(failures).__name__}"
+        )
     similar = None
     if near is not None and is_proposal_of(sim, near.proposal):
         similar = None if isinstance(near.proposal, Sample) else near.proposal  # it draws nothing
@@ -286,7 +291,7 @@ def adaptive_cross_entropy(
     remark = "one Gaussian covers one failure mode, and no others were looked for"
     return result._replace(
         method=name,
-        episodes=budget,
+        episodes=int(found.episodes) + result.episodes,
         settings=settings,
         reliable=result.reliable and not reasons,
         warnings=(*reasons, *result.warnings, remark),
