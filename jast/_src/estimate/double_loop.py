@@ -96,7 +96,7 @@ def double_loop(
     total, notes, reasons = chunks(_simulate_chunk, shared, lanes, watch)
     about = dict(level=level, reasons=reasons, notes=notes)
     found = estimate_from_weights(name, total, evaluations=total.samples * samples, **about)
-    return found._replace(settings=settings, draws=None)
+    return found._replace(settings=settings)
 
 
 def _simulate_chunk(shared, i, context):
@@ -121,7 +121,6 @@ def _simulate_starts(key, sim, proposal, lanes, samples):
             failure=fails,
             invalid=jnp.any(rows.invalid),
             length=jnp.sum(rows.length),
-            distance=jnp.min(rows.distance),
         )
 
     return jax.vmap(one)(jax.random.split(key, lanes))

@@ -184,9 +184,9 @@ def failure_probability(
             f"{name}: failures must be an archive of jast.failures, as the failures of a search,"
             f" received {type(failures).__name__}"
         )
-    similar = None
-    if near is not None and is_proposal_of(sim, near.proposal):
-        similar = None if isinstance(near.proposal, Sample) else near.proposal  # it draws nothing
+    similar = None if near is None else near.proposal
+    if isinstance(similar, Sample) or not is_proposal_of(sim, similar):  # a sample draws nothing
+        similar = None
     guided = failures is not None or similar is not None
     by_default = budget is None and seconds is None and not guided and checkpoint is None
     if budget is None:
@@ -204,16 +204,15 @@ def failure_probability(
         briefly(few),
     ):
         placement = placement._replace(store=store)
+        about = dict(level=level, watched=watched, placement=placement)
+        populations = partial(by_populations, name, key, sim, **about)
         if not (guided or few):
-            found = by_populations(
-                name, key, sim, budget, level=level, watched=watched, placement=placement
-            )
+            found = populations(budget)
         elif budget < MIN_BUDGET and transform.dimension(sim) <= MAX_SURROGATE_NUMBERS:
             found = few_calls.few_calls(key, sim, budget, level, known, progress, callback)
         else:
             # tilts may have spent half, and populations know nothing of failures given
             serve = not (guided or runs_on_host(sim)) and budget >= 2 * POPULATIONS_LEAST
-            about = dict(level=level, watched=watched, placement=placement)
             wanted = Request(
                 name=name,
                 key=key,
@@ -223,10 +222,8 @@ def failure_probability(
                 failures=failures,
                 failure_points=known,
                 near=similar,
-                level=level,
-                watched=watched,
-                placement=placement,
-                otherwise=partial(by_populations, name, key, sim, **about) if serve else None,
+                **about,
+                otherwise=populations if serve else None,
             )
             found = estimate_by_proposal(wanted)
             found = flag_imprecise(found) if budget >= MIN_BUDGET else found

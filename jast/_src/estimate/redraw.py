@@ -44,7 +44,8 @@ def redraw(key: Any, sim: Any, q: Any, n: int) -> tuple[np.ndarray, Outcomes, np
     if isinstance(q, Sample):
         return _choose_failures(key, sim, q, n)
     if isinstance(q, tilts.Tilts):
-        return _redraw_tilts(key, sim, q, n)
+        o, log_w, _, trace = tilts.draw_tilts(sim, q, key, n, n)
+        return transform.normal_of(sim, _episodes_of_traces(sim, trace)), o, log_w
     return draw_mixture(sim, q, *random_numbers(key, n, q.means.shape[1], q.means.dtype))[:3]
 
 
@@ -115,11 +116,6 @@ def sample_of_draws(sim: Any, draws: Draws, most: int) -> Sample:
         log_weight=log_w,
         group=np.arange(len(points), dtype=np.int32),
     )
-
-
-def _redraw_tilts(key, sim, q, n):
-    o, log_w, _, trace = tilts.draw_tilts(sim, q, key, n, n)
-    return transform.normal_of(sim, _episodes_of_traces(sim, trace)), o, log_w
 
 
 def _choose_failures(key, sim, sample, n):

@@ -23,6 +23,7 @@ __all__ = ["descend", "design_points", "distinct", "explained", "may_matter"]
 
 APART = 0.5  # of the norm of a point: those nearer to it are the same
 MOST = 48  # descents of a call
+LIMIT = 16  # design points of a call, at most
 BLOCK = 12  # descents that run side by side
 LITTLE = math.log(1e-3)  # log of a part of the probability that does not matter
 GRADIENT = 3  # evaluations that a value with its gradient counts as
@@ -37,15 +38,13 @@ class DesignPoints(NamedTuple):
     evaluations: int
 
 
-def design_points(
-    key: jax.Array, sim: Simulator, starts: int = MOST, limit: int = 16
-) -> DesignPoints:
-    """At most ``limit`` distinct `DesignPoints` of ``sim`` from ``starts`` draws of the model; none
+def design_points(key: jax.Array, sim: Simulator, starts: int = MOST) -> DesignPoints:
+    """At most `LIMIT` distinct `DesignPoints` of ``sim`` from ``starts`` draws of the model; none
     where the miss distance has no useful gradient.
     """
     z = numpy_generator(key).standard_normal((starts, dimension(sim)))
     found = descend(sim, z)
-    return found._replace(points=distinct(found.points, limit))
+    return found._replace(points=distinct(found.points, LIMIT))
 
 
 def descend(sim: Simulator, starts: np.ndarray) -> DesignPoints:

@@ -80,10 +80,8 @@ def estimate_from_plain_draws(search: PopulationSearch, name: str, level: float)
     lanes = lanes_of_points(search.sim)
     if n > 0 and not search.interrupted:
         watch = Watch(name, n, "episode", False, None)
-        shared, placement = (
-            (search.key, search.sim, lanes, n),
-            search.placement._replace(name="plain"),
-        )
+        shared = search.key, search.sim, lanes, n
+        placement = search.placement._replace(name="plain")
         try:
             total, notes, reasons = chunks(simulate_points, shared, lanes, watch, placement)
             search.reasons += reasons

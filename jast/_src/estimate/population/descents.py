@@ -287,19 +287,19 @@ def by_width(
     if failing.sum() < 2:
         return population.without_failures()
     log_w = _indicator_log_weights(failing)
+    before = None
     while width > 1:
         population.multiply(log_w)
-        before = levels[-2] if len(levels) > 1 else width
         population.resample_and_move(log_w, -np.inf, width=width, before=before)
         p = population.particles
         square, used = (np.asarray(a, np.float64)[: population.n] for a in (p.square, p.used))
-        width = _next_width(square, used, width, settings.effective_share)
-        log_w = _log_density_ratio(square, used, levels[-1], width)
+        before, width = width, _next_width(square, used, width, settings.effective_share)
+        log_w = _log_density_ratio(square, used, before, width)
         levels.append(width)
         gone = population.log_mean < settings.min_log_probability
         if gone or population.variance(log_w) > settings.max_variance:
             return population.without_failures()
-    return population.with_failures(log_w, before=levels[-2] if len(levels) > 1 else None)
+    return population.with_failures(log_w, before=before)
 
 
 def _find_width(population, settings):

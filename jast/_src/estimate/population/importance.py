@@ -133,9 +133,8 @@ def _draw_estimate(search, name, said, key, proposal, level):
     interruption left none.
     """
     watch = Watch(name, proposal.draws, "episode", False, None)
-    placement = search.placement._replace(
-        name=said.replace(" ", "-")
-    )  # each has a checkpoint of its own
+    # each has a checkpoint of its own
+    placement = search.placement._replace(name=said.replace(" ", "-"))
     try:
         found = draw_estimate(
             key,

@@ -64,7 +64,10 @@ class DevicePaths:
     def __init__(self, key: jax.Array, sim: Simulator, score: Callable | None, n: int):
         self.sim, self.score, self.n = sim, score, n
         self.key, self.times = counter_key(key, 1), 0
-        self.store = _empty(sim, n)
+        signature, rows = signature_of(sim), sim.horizon + 1
+        states = jax.tree.map(lambda s: np.zeros((rows, n, *s.shape), s.dtype), signature.state)
+        scores = np.zeros((rows, n), signature.dtype)
+        self.store = jax.device_put(Store(states, scores, np.zeros(n, np.int32)))
 
     def play(self, paths: np.ndarray, parents: np.ndarray, level: float) -> Played:
         """As `levels.Paths`."""
@@ -95,13 +98,6 @@ def require_paths(name: str, sim: Simulator, n: int) -> None:
     row = size(signature.state) + np.dtype(signature.dtype).itemsize
     needed = 2 * n * (sim.horizon + 1) * row
     require(name, needed, f"the states of {n} episodes", "use fewer particles")
-
-
-def _empty(sim: Simulator, n: int) -> Store:
-    signature, rows = signature_of(sim), sim.horizon + 1
-    states = jax.tree.map(lambda s: np.zeros((rows, n, *s.shape), s.dtype), signature.state)
-    scores = np.zeros((rows, n), signature.dtype)
-    return jax.device_put(Store(states, scores, np.zeros(n, np.int32)))
 
 
 @partial(jit, donate_argnums=0)

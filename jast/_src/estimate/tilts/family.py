@@ -79,7 +79,6 @@ class Play(NamedTuple):
     """[n] miss distance; -inf for a failure"""
     log_weight: np.ndarray
     """[n] log p - log q"""
-    invalid: int
 
 
 class TiltFamily(NamedTuple):
@@ -145,7 +144,7 @@ class TiltFamily(NamedTuple):
         o, ratio, trace = simulate_tilts(self.sim, tilts, u, first, noise)
         joint = ratio.astype(np.float64) + np.asarray(tilts.log_weights, np.float64)[None]
         log_w, points = -np.logaddexp.reduce(joint, axis=1), Points(trace, np.asarray(o.length))
-        return Play(points, np.asarray(o.score), log_w, int(np.sum(o.invalid)))
+        return Play(points, np.asarray(o.score), log_w)
 
     def draw(self, q: Mixture) -> Batch:
         return at_level(self, q, self.play(q), -np.inf)
@@ -239,13 +238,7 @@ def at_level(family: TiltFamily, q: Mixture, p: Play, level: float) -> Batch:
     near = np.flatnonzero(p.score <= level)
     rows = near[: family.settings.failures_kept]
     size = len(p.score) * len(rows) // len(near) if len(near) else len(p.score)
-    return Batch(
-        q=q,
-        points=family.select(p.points, rows),
-        log_weight=p.log_weight[rows],
-        size=size,
-        invalid=p.invalid,
-    )
+    return Batch(q, family.select(p.points, rows), p.log_weight[rows], size)
 
 
 def _join(*points: Points) -> Points:
