@@ -304,3 +304,22 @@ def test_a_failure_at_the_edge_is_explained(key):
     assert np.asarray(explain.minimal(sim, failing).needed).tolist() == [False, True]
     with pytest.raises(ValueError, match="must fail when it is replayed"):
         explain.minimal(sim, jast.replay(sim, below))
+
+
+@pytest.mark.slow
+def test_a_failure_at_its_far_edge_is_explained():
+    """There it fails again a little nearer to the mode."""
+    law = Uniform(0.0, 1.0)
+    x = np.linspace(0.6, 0.9, 500, dtype=np.float32)
+    there_and_back = jax.vmap(lambda a: D.from_normal(law, D.to_normal(law, a)))(x)
+    edge = x[np.flatnonzero(np.asarray(there_and_back) > x)[0]]
+    sim = jast.Simulator(
+        init=lambda x0: jnp.float32(0),
+        step=lambda s, x: jnp.maximum(s, x),
+        disturbance=lambda s: Uniform(jnp.float32(0), jnp.float32(1)),
+        evaluate=lambda s: ((s >= 0.55) & (s <= edge), jnp.where(s < 0.55, 0.55 - s, s)),
+        horizon=2,
+    )
+    failing = jast.replay(sim, jnp.asarray([0.1, edge], jnp.float32))
+    assert bool(failing.failure)
+    assert np.asarray(explain.minimal(sim, failing).needed).tolist() == [False, True]
