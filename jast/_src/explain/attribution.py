@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Any, Literal, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from jast._src.core.counter_prng import numpy_generator
@@ -13,8 +12,8 @@ from jast._src.core.episode import Episode
 from jast._src.core.simulator import Simulator
 from jast._src.core.typing import PRNGKey
 from jast._src.normal_space import episode_point
-from jast._src.normal_space.design_point_descent import differentiable
 from jast._src.normal_space.episode_point import EpisodePoint
+from jast._src.normal_space.gradients import gradients
 from jast._src.runtime.host_errors import runs_on_host
 from jast._src.util import checks, display
 
@@ -210,18 +209,13 @@ def _gradient(g: EpisodePoint) -> np.ndarray:
 
 
 def _gradients(g: EpisodePoint, points: np.ndarray) -> np.ndarray:
-    slopes = np.asarray(_slopes(g.sim, jnp.asarray(points, g.evaluate.dtype)), np.float64)
+    slopes = gradients(g.sim, points).slope.astype(np.float64)
     if not np.isfinite(slopes).all() or not slopes.any():
         raise ValueError(
             "attribution: the miss distance has no finite gradient, or one of 0; expected"
             ' method="shapley", which needs none'
         )
     return slopes
-
-
-@jax.jit
-def _slopes(sim: Simulator, points: jax.Array) -> jax.Array:
-    return jax.vmap(jax.grad(lambda z: differentiable(sim, z).distance))(points)
 
 
 def _checked_finite(distance: np.ndarray) -> np.ndarray:

@@ -6,20 +6,16 @@ Fiessler 1978). A miss distance is flat once a system fails, so a step that arri
 failures is halved back to the boundary.
 """
 
-from functools import partial
 from typing import NamedTuple
 
-import jax
-import jax.numpy as jnp
+import numpy as np
 
-from jast import distributions as D
-from jast._src.core.episode import play_chosen
-from jast._src.core.rewards import log_likelihood
 from jast._src.core.simulator import Simulator
-from jast._src.normal_space.transform import outcome, policy_of
-from jast._src.runtime._jax import jit
+from jast._src.core.typing import Array
+from jast._src.normal_space.evaluate_points import evaluate_points
+from jast._src.normal_space.gradients import gradients
 
-__all__ = ["Descents", "EPISODES", "STEPS", "descents", "differentiable"]
+__all__ = ["Descents", "EPISODES", "STEPS", "descents"]
 
 STEPS = 12  # of a descent
 HALVINGS = 5  # of the way back to the boundary, in each step
@@ -31,106 +27,41 @@ BEYOND = 1.0 + 1e-4  # of the boundary, so that rounding leaves failures failure
 
 
 class Descents(NamedTuple):
-    """What n descents came to, [n, ...] each."""
+    """What n descents came to, [n, ...] each, on the host."""
 
-    point: jax.Array
+    point: Array
     """[D] the failing point of least norm; the start where there is none."""
-    found: jax.Array
+    found: Array
     """bool: there is one."""
-    nearest: jax.Array
+    nearest: Array
     """[D] the point of least distance among those that were differentiated."""
-    distance: jax.Array
+    distance: Array
     """The distance there; inf where none is valid."""
-    useful: jax.Array
+    useful: Array
     """int32: how many of the gradients led somewhere."""
-    failing: jax.Array
+    failing: Array
     """int32: failing episodes."""
-    invalid: jax.Array
+    invalid: Array
     """int32: invalid ones among those that were differentiated."""
-    first: jax.Array
+    first: Array
     """int32: the step, from 0 on, of which the first failure was; `STEPS` where none was."""
-    slopes: jax.Array
+    slopes: Array
     """int32: simulator steps of the episodes that were differentiated."""
-    steps: jax.Array
+    steps: Array
     """int32: simulator steps of the others."""
 
 
-@jit
-def descents(sim: Simulator, starts: jax.Array) -> Descents:
-    """`Descents` of ``sim`` from the points ``starts`` [n, D]."""
-    return jax.vmap(partial(_one, sim))(starts)
-
-
-def differentiable(sim, z):
-    """The `Episode` of ``z`` [D]: of constant length, so that it can be differentiated backwards,
-    and without a random number.
+def descents(sim: Simulator, starts: np.ndarray) -> Descents:
+    """`Descents` of ``sim`` from the points ``starts`` [n, D]. The system's steps are in two
+    programs alone, that of `evaluate_points` and that of `gradients`.
     """
-    policy = policy_of(sim, z)
-
-    def choose(state, t, _):
-        return D.mode(policy.disturbance(state, t))
-
-    return play_chosen(sim, log_likelihood, D.mode(policy.start()), choose, (), sim.horizon)
-
-
-def _one(sim, start):
-    def step(carry, i):
-        z, so_far = carry
-
-        def distance(z):
-            e = differentiable(sim, z)
-            return e.distance, e
-
-        (g, e), slope = jax.value_and_grad(distance, has_aux=True)(z)
-        square = jnp.sum(slope**2)
-        usable = jnp.isfinite(g) & jnp.isfinite(square) & (square > 0)
-        length = (jnp.dot(slope, z) - g) / jnp.where(usable, square, 1)
-        aim = jnp.where(usable, jnp.where(usable, length, 0) * jnp.where(usable, slope, 0), z)
-        most = FARTHER * jnp.linalg.norm(z) + FIRST
-        shorter = jnp.minimum(1, most / jnp.maximum(jnp.linalg.norm(aim), 1e-6))
-        aim = aim * shorter * jnp.asarray(BEYOND, z.dtype)
-
-        def halve(ends, i):
-            outside, inside = ends
-            halves = i > 0
-            here = jnp.where(halves, (outside + inside) / 2, inside)
-            there = outcome(sim, here)
-            outside = jnp.where(there.failure | ~halves, outside, here)
-            inside = jnp.where(there.failure & halves, here, inside)
-            return (outside, inside), (there.failure, there.length)
-
-        # one program for the aim and for the halves of the way to it
-        number = jnp.arange(HALVINGS + 1, dtype=jnp.int32)
-        (outside, inside), (failures_there, lengths) = jax.lax.scan(halve, (z, aim), number)
-        fails = failures_there[0]
-        closer = jnp.sum(inside**2) < jnp.sum(so_far.point**2)
-        better = fails & (~so_far.found | closer)
-        nearer = jnp.isfinite(g) & (g < so_far.distance)
-        whole = partial(jnp.sum, dtype=jnp.int32)
-        failing = whole(e.failure) + whole(failures_there)
-        return (
-            jnp.where(fails, outside, aim),
-            Descents(
-                point=jnp.where(better, inside, so_far.point),
-                found=so_far.found | fails,
-                nearest=jnp.where(nearer, z, so_far.nearest),
-                distance=jnp.where(nearer, g, so_far.distance),
-                useful=so_far.useful + whole(usable),
-                failing=so_far.failing + failing,
-                invalid=so_far.invalid + whole(~jnp.isfinite(g)),
-                first=jnp.where((failing > 0) & (so_far.first == STEPS), i, so_far.first),
-                slopes=so_far.slopes + e.length,
-                steps=so_far.steps + whole(lengths),
-            ),
-        ), None
-
-    none = jnp.zeros((), jnp.int32)
-    like = jax.eval_shape(lambda z: outcome(sim, z).distance, start)
-    nothing = Descents(
-        point=start,
-        found=jnp.zeros((), bool),
-        nearest=start,
-        distance=jnp.asarray(jnp.inf, like.dtype),
+    n, none = len(starts), np.zeros(len(starts), np.int32)
+    z, distance = starts, np.full(n, np.inf, starts.dtype)
+    d = Descents(
+        point=starts,
+        found=np.zeros(n, bool),
+        nearest=starts,
+        distance=distance,
         useful=none,
         failing=none,
         invalid=none,
@@ -138,5 +69,50 @@ def _one(sim, start):
         slopes=none,
         steps=none,
     )
-    index = jnp.arange(STEPS, dtype=jnp.int32)
-    return jax.lax.scan(step, (start, nothing), index)[0][1]
+    for i in range(STEPS):
+        g = gradients(sim, z)
+        valid = np.isfinite(g.distance)
+        aim, usable = _nearest_on_the_boundary(z, g.distance, g.slope)
+        there = evaluate_points(sim, aim)
+        fails, outside, inside = there.failure, z, aim
+        failing, steps = g.failure.astype(np.int32) + fails, there.length
+        for _ in range(HALVINGS):
+            here = (outside + inside) / 2
+            there = evaluate_points(sim, here)
+            failed = there.failure[:, None]
+            outside, inside = np.where(failed, outside, here), np.where(failed, here, inside)
+            failing, steps = failing + there.failure, steps + there.length
+        closer = (inside**2).sum(axis=1) < (d.point**2).sum(axis=1)
+        better = (fails & (~d.found | closer))[:, None]
+        nearer = valid & (g.distance < d.distance)
+        d = Descents(
+            point=np.where(better, inside, d.point),
+            found=d.found | fails,
+            nearest=np.where(nearer[:, None], z, d.nearest),
+            distance=np.where(nearer, g.distance, d.distance),
+            useful=d.useful + usable,
+            failing=d.failing + failing,
+            invalid=d.invalid + ~valid,
+            first=np.where((failing > 0) & (d.first == STEPS), i, d.first),
+            slopes=d.slopes + g.length,
+            steps=d.steps + steps,
+        )
+        z = np.where(fails[:, None], outside, aim)
+    return d
+
+
+def _nearest_on_the_boundary(
+    z: np.ndarray, distance: np.ndarray, slope: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """The point nearest to the origin on the linearised boundary, and a little beyond it, for each
+    of ``z`` [n, D]; and whether its gradient was usable [n].
+    """
+    square = (slope**2).sum(axis=1)
+    usable = np.isfinite(distance) & np.isfinite(square) & (square > 0)
+    some = usable[:, None]
+    slope = np.where(some, slope, 0)
+    length = ((slope * z).sum(axis=1) - np.where(usable, distance, 0)) / np.where(usable, square, 1)
+    aim = np.where(some, length[:, None] * slope, z)
+    most = FARTHER * np.linalg.norm(z, axis=1) + FIRST
+    shorter = np.minimum(1, most / np.maximum(np.linalg.norm(aim, axis=1), 1e-6))
+    return aim * shorter[:, None].astype(z.dtype) * z.dtype.type(BEYOND), usable

@@ -14,17 +14,15 @@ import numpy as np
 
 from jast._src.core.signature import signature_of
 from jast._src.core.simulator import Simulator
-from jast._src.normal_space.design_point_descent import differentiable
 from jast._src.normal_space.evaluate_points import evaluate_points
+from jast._src.normal_space.gradients import COST
+from jast._src.normal_space.gradients import gradients as compute_gradients
 from jast._src.normal_space.transform import Outcomes, outcomes_of, simulate
-from jast._src.runtime._jax import quick
-from jast._src.runtime.checkpoints import answer_once
 
 __all__ = ["Linearised", "cost_of_slopes", "distances", "slopes"]
 
 STEP = 0.1
 """Standard deviations that one number is moved by, to see what it changes."""
-GRADIENT = 3  # evaluations that a value with its gradient counts as
 
 
 class Linearised(NamedTuple):
@@ -65,7 +63,7 @@ def cost_of_slopes(sim: Simulator, d: int, gradients: bool) -> int:
     """Evaluations of `slopes`. A gradient tells of one moment, so that differences are cheaper
     where there are many.
     """
-    return GRADIENT if gradients and sim.episodic else d + 1
+    return COST if gradients and sim.episodic else d + 1
 
 
 def slopes(sim: Simulator, point: np.ndarray, gradients: bool) -> Linearised:
@@ -73,16 +71,10 @@ def slopes(sim: Simulator, point: np.ndarray, gradients: bool) -> Linearised:
     each towards the model's middle, where failures are rarer.
     """
     if gradients and sim.episodic:
-        g, slope = answer_once(_gradients, sim, point[None])
-        return Linearised(point, g.astype(np.float64), slope.astype(np.float64))
+        here = compute_gradients(sim, point[None])
+        return Linearised(point, *(a.astype(np.float64) for a in (here.distance, here.slope)))
     step = np.where(point > 0, -STEP, STEP)
     moved = point + np.concatenate([np.zeros((1, len(point))), np.diag(step)]).astype(point.dtype)
     _, g = distances(sim, moved)
     slope = ((g[1:] - g[0]) / step[:, None]).T
     return Linearised(point, g[0], np.nan_to_num(slope))
-
-
-@quick
-def _gradients(sim: Simulator, z: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Distances [n] and their gradients [n, D]."""
-    return jax.vmap(jax.value_and_grad(lambda z: differentiable(sim, z).distance))(z)

@@ -345,10 +345,11 @@ def latents(sim, recorded, of_start):
     """
 
     def one(x0, x, length):
-        e = play_back(sim, rewards.STANDARD, x0, x, length)
-        states = jax.tree.map(lambda a: a[:-1], e.states)
-        z = jax.vmap(lambda s, x: D.to_normal(sim.disturbance(s), x))(states, e.disturbances)
-        live = jnp.arange(sim.horizon, dtype=jnp.int32) < e.length
+        # of states alone: where the disturbance depends on none, XLA drops the simulation
+        states = play_back(sim, rewards.STANDARD, x0, x, length).states
+        states = jax.tree.map(lambda a: a[:-1], states)
+        z = jax.vmap(lambda s, x: D.to_normal(sim.disturbance(s), x))(states, x)
+        live = jnp.arange(sim.horizon, dtype=jnp.int32) < length
         z = jax.tree.map(lambda a: jnp.where(live.reshape(-1, *(1,) * (a.ndim - 1)), a, 0), z)
         return D.to_normal(sim.start(), x0) if of_start else (), z
 

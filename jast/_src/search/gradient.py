@@ -123,7 +123,7 @@ class _Search:
         """The descents."""
         sim, n = self.sim, self.starts
         z = jax.random.normal(self.draw, (n, dimension(sim)), normal_numbers(sim))
-        d = jax.device_get(descents(sim, z))
+        d = descents(sim, np.asarray(z))
         failing = self._failing(d.point[np.isfinite(d.point).all(axis=1) & d.found])
         nearest = self._scored(played(sim, d.nearest[[np.argmin(d.distance)]]))
         first = int(d.first.min())

@@ -3,20 +3,16 @@ from many starts (`normal_space.design_point_descent`).
 """
 
 import math
-from functools import partial
 from typing import NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
-from jax import lax
 
 from jast._src.core.counter_prng import numpy_generator
 from jast._src.core.simulator import Simulator
 from jast._src.normal_space.design_point_descent import EPISODES, STEPS, descents
+from jast._src.normal_space.gradients import COST
 from jast._src.normal_space.transform import dimension, normal_numbers, unit
-from jast._src.runtime._jax import quick
-from jast._src.runtime.checkpoints import answer_once
 from jast._src.util.blocked_matmul import product
 
 __all__ = ["descend", "design_points", "distinct", "explained", "may_matter"]
@@ -24,9 +20,7 @@ __all__ = ["descend", "design_points", "distinct", "explained", "may_matter"]
 APART = 0.5  # of the norm of a point: those nearer to it are the same
 MOST = 48  # descents of a call
 LIMIT = 16  # design points of a call, at most
-BLOCK = 12  # descents that run side by side
 LITTLE = math.log(1e-3)  # log of a part of the probability that does not matter
-GRADIENT = 3  # evaluations that a value with its gradient counts as
 
 
 class DesignPoints(NamedTuple):
@@ -48,28 +42,10 @@ def design_points(key: jax.Array, sim: Simulator, starts: int = MOST) -> DesignP
 
 
 def descend(sim: Simulator, starts: np.ndarray) -> DesignPoints:
-    """The `DesignPoints` that at most `MOST` ``starts`` [n, D] lead to, in no order."""
-    n = len(starts)
-    z = np.zeros((MOST, dimension(sim)), normal_numbers(sim))
-    z[:n] = starts
-    points, failing = (a[:n] for a in answer_once(partial(_in_blocks, sim), z, np.int32(n)))
-    points = points[failing & np.isfinite(points).all(axis=1)].astype(np.float64)
-    return DesignPoints(points, n * (STEPS * GRADIENT + EPISODES))
-
-
-@quick
-def _in_blocks(sim, starts, n):
-    """(points, whether there is one) of the descents from the first ``n`` of ``starts``, a block at
-    a time, so that one program serves every number of them.
-    """
-
-    def block(i, out):
-        d = descents(sim, lax.dynamic_slice_in_dim(starts, i * BLOCK, BLOCK))
-        place = partial(lax.dynamic_update_slice_in_dim, start_index=i * BLOCK, axis=0)
-        return tuple(place(a, b) for a, b in zip(out, (d.point, d.found), strict=True))
-
-    nothing = jnp.zeros_like(starts), jnp.zeros(len(starts), bool)
-    return lax.fori_loop(0, (n + BLOCK - 1) // BLOCK, block, nothing)
+    """The `DesignPoints` that the ``starts`` [n, D] lead to, in no order."""
+    d = descents(sim, np.asarray(starts, normal_numbers(sim)))
+    points = d.point[d.found & np.isfinite(d.point).all(axis=1)].astype(np.float64)
+    return DesignPoints(points, len(starts) * (STEPS * COST + EPISODES))
 
 
 def distinct(points: np.ndarray, limit: int) -> np.ndarray:

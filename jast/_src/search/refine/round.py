@@ -3,19 +3,12 @@ the slopes that the next candidates follow. The system's steps are in two progra
 `normal_space.evaluate_points` and that of the gradients.
 """
 
-from functools import partial
-
-import jax
-import jax.numpy as jnp
 import numpy as np
 
-from jast._src.core.episode import rollout
-from jast._src.core.rewards import likelihood
 from jast._src.core.simulator import Simulator
 from jast._src.normal_space.evaluate_points import evaluate_points
-from jast._src.normal_space.transform import Outcomes, policy_of
-from jast._src.runtime._jax import quick
-from jast._src.runtime.checkpoints import step_once
+from jast._src.normal_space.gradients import gradients
+from jast._src.normal_space.transform import Outcomes
 from jast._src.runtime.host_errors import runs_on_host
 from jast._src.search.refine.candidates import (
     NEAREST,
@@ -26,7 +19,6 @@ from jast._src.search.refine.candidates import (
     candidates,
     resize_steps,
 )
-from jast._src.util.pytrees import map_in_lanes
 
 __all__ = ["first_points", "residuals", "round_of"]
 
@@ -40,8 +32,6 @@ OUTSIDE = 0.01
 """How far outside of the failures gradients are taken at most, as a share of the way there."""
 EDGE = 0.05
 """How far outside of them differences are taken at least."""
-GROUP = 4
-"""Points whose gradients are one call of the program."""
 
 
 def first_points(sim: Simulator, v: np.ndarray) -> tuple[Point, np.ndarray]:
@@ -122,27 +112,8 @@ def _gradients(sim, points):
     """
     v = (1 - np.minimum(points.gap, OUTSIDE))[:, None] * points.v
     v = np.where(v == 0, -ASIDE * np.sign(points.slope), v).astype(points.v.dtype)
-    found = step_once(
-        lambda: map_in_lanes(GROUP, partial(_slopes, sim), v),
-        v,
-        like=lambda: jnp.zeros((len(v), 2, v.shape[1]), v.dtype),
-    )
-    return found[:, 0], found[:, 1]
-
-
-@quick
-def _slopes(sim, v):
-    """The gradients of the distance and of the cost [n, 2, D] at ``v`` [n, D]."""
-
-    def both(v):
-        e = rollout(jax.random.key(0), sim, policy_of(sim, v), likelihood(sim))
-        return jnp.stack([e.distance.astype(v.dtype), -e.reward.astype(v.dtype)])
-
-    def one(v):
-        _, back = jax.vjp(both, v)
-        return jax.vmap(lambda row: back(row)[0])(jnp.eye(2, dtype=v.dtype))
-
-    return jax.vmap(one)(v)
+    g = gradients(sim, v)
+    return g.slope, g.rise
 
 
 def _differences(sim, points, part):
