@@ -119,7 +119,7 @@ def _parser():
         " where a count of a search is given)",
     )
     for name, text in [
-        ("--budget", "evaluations of stress (default: what some eight CPU seconds simulate)"),
+        ("--budget", "evaluations of stress (default: what some four CPU seconds simulate)"),
         ("--trees", "independent searches (default: 200)"),
         (
             "--simulations",

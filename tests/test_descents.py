@@ -482,7 +482,7 @@ def test_known_failures_and_neighbours_lead_a_proposal(key, monkeypatch):
     near = population(key, SIDES, 40_000, particles=256)
     monkeypatch.setattr(adaptive, "by_populations", by_populations)
     monkeypatch.setattr(adaptive, "estimate_by_proposal", sought)
-    monkeypatch.setattr(budgets, "episodes_a_second", lambda key, sim: 1e6)
+    monkeypatch.setattr(budgets, "episodes_a_second", lambda key, sim: 2e6)
     failures = jast.failures.collect(
         SIDES, jast.rewards.likelihood(SIDES), episodes_of(SIDES, near.proposal.points[:10])
     )

@@ -29,6 +29,9 @@ class HalfNormal:
     def isf(self, q):
         return 1.3 * np.sqrt(st.chi2(1).isf(q))
 
+    def support(self):
+        return 0.0, np.inf
+
     def logpdf(self, x):
         return st.halfnorm(scale=1.3).logpdf(x)
 
@@ -73,6 +76,18 @@ def truth(scipys, z):
     """By the tail in which z is."""
     z = np.asarray(z, np.float64)
     return np.where(z < 0, scipys.ppf(st.norm.cdf(z)), scipys.isf(st.norm.sf(z)))
+
+
+@pytest.mark.parametrize("name", [n for n in floats("float32") if n != "of exp"])
+def test_nothing_lies_outside_of_the_support(name, dtype):
+    """But what distrax's own density says of its transformed numbers."""
+    d, scipys = floats(dtype)[name]
+    for end, outwards, below in zip(scipys.support(), (-1, 1), (0, 1), strict=True):
+        if np.isfinite(end):
+            x = jnp.asarray(end + outwards, dtype)
+            assert float(d.log_prob(x)) == -np.inf
+            assert float(D.cdf(d, x)) == below
+
 
 
 def mapped(function, values):

@@ -465,7 +465,7 @@ def test_a_cheap_system_is_answered_by_populations_and_names_its_budget(key, mon
     """A rate of 50,000 a second asks for 3 2^17 evaluations; the same call with these has the same
     bits.
     """
-    monkeypatch.setattr(budgets, "episodes_a_second", lambda key, sim: 5e4)
+    monkeypatch.setattr(budgets, "episodes_a_second", lambda key, sim: 1e5)
     found = failure_probability(key, SIDES)
     assert found.settings["budget"] == 3 * 2**17 and "populations" in found.method
     again = failure_probability(key, SIDES, 3 * 2**17)
@@ -503,7 +503,7 @@ def test_a_default_call_is_made_again_where_a_known_budget_would_do(
             two._replace(mean=mean, relative_error=relative, reliable=True, warnings=())
         )
 
-    monkeypatch.setattr(budgets, "episodes_a_second", lambda key, sim: 5e4)
+    monkeypatch.setattr(budgets, "episodes_a_second", lambda key, sim: 1e5)
     monkeypatch.setattr(module, "by_populations", answer_with)
     found = failure_probability(key, SIDES, given)
     assert called == budgets_used and found.settings["budget"] == called[-1]
@@ -522,7 +522,7 @@ def test_a_default_call_by_plain_draws_is_made_again_too(two, key, monkeypatch):
             raise KeyboardInterrupt
         return wide
 
-    monkeypatch.setattr(budgets, "episodes_a_second", lambda key, sim: 5e4)
+    monkeypatch.setattr(budgets, "episodes_a_second", lambda key, sim: 1e5)
     monkeypatch.setattr(module, "by_populations", answer_with)
     found = failure_probability(key, SIDES)
     assert called == [3 * 2**17, 2**20] and found.settings["budget"] == called[0]

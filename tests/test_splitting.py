@@ -446,6 +446,12 @@ def test_a_score_that_says_nothing_is_flagged(key):
     assert any("scores are NaN" in text for text in undefined.warnings)
 
 
+@pytest.mark.parametrize("value", [1j, True, "far", np.zeros(2)])
+def test_a_score_is_a_real_number(key, value):
+    with pytest.raises(ValueError, match="splitting: score"):
+        splitting(key, autoregression(), 50, runs=3, score=lambda s: value)
+
+
 def test_failures_of_one_ancestor_are_flagged(key):
     """Ten particles and a rare failure: each run is the story of one episode."""
     sim = autoregression(evaluate=lambda s: (s >= 9.0, jnp.maximum(9.0 - s, 0.0)))

@@ -117,8 +117,9 @@ class Uniform(Elementwise):
 
 
 def log_power(x: Array, k: Array) -> Array:
-    """The log of x^k, which is 0 for k = 0 at x = 0, too."""
-    return k * jnp.log(jnp.where((k == 0) & (x == 0), 1, x))
+    """The log of x^k, which is 0 for k = 0 at x = 0, too; -inf for x < 0, outside of a support."""
+    safe = jnp.where(((k == 0) & (x == 0)) | (x < 0), 1, x)
+    return jnp.where(x < 0, -jnp.inf, k * jnp.log(safe))
 
 
 class _Pair(Elementwise):

@@ -147,8 +147,12 @@ def _beta(d, z):
 
 def _tails_beta(d, x):
     kind = jnp.finfo(x.dtype)  # at an end of the support half a unit of rounding from there
-    x, rest = jnp.maximum(x, kind.tiny), jnp.maximum(1 - x, kind.eps / 4)
-    return beta_tails(d.alpha, d.beta, jnp.log(jnp.minimum(x, 1)) - jnp.log(jnp.minimum(rest, 1)))
+    low, high = jnp.maximum(x, kind.tiny), jnp.maximum(1 - x, kind.eps / 4)
+    logit = jnp.log(jnp.minimum(low, 1)) - jnp.log(jnp.minimum(high, 1))
+    below, above = beta_tails(d.alpha, d.beta, logit)
+    sure, never = jnp.zeros_like(below), jnp.full_like(below, -jnp.inf)
+    below = jnp.where(x < 0, never, jnp.where(x > 1, sure, below))
+    return below, jnp.where(x < 0, sure, jnp.where(x > 1, never, above))
 
 
 def _mode_of_beta(d):

@@ -43,8 +43,10 @@ class LogNormal(LocationScale):
         return jnp.exp(self._placed(jax.random.normal(key, **self._like_n(n))))
 
     def log_prob(self, value: Any) -> Array:
-        log = jnp.log(value)
-        return -0.5 * jnp.square(self._standardize(log)) - HALF_LOG_2PI - jnp.log(self._scale) - log
+        possible = value > 0
+        log = jnp.log(jnp.where(possible, value, 1))
+        density = -0.5 * jnp.square(self._standardize(log)) - HALF_LOG_2PI - jnp.log(self._scale)
+        return jnp.where(possible, density - log, -jnp.inf)
 
     def mean(self) -> Any:
         return jnp.exp(self.loc + jnp.square(self.scale) / 2)
@@ -59,9 +61,9 @@ class LogNormal(LocationScale):
 register(
     LogNormal,
     quantile=lambda d, u: jnp.exp(d.loc + d.scale * ndtri(inside(u))),
-    cdf=lambda d, x: ndtr((jnp.log(x) - d.loc) / d.scale),
+    cdf=lambda d, x: ndtr((jnp.log(jnp.maximum(x, 0)) - d.loc) / d.scale),
     from_normal=lambda d, z: jnp.exp(d.loc + d.scale * z),
-    to_normal=lambda d, x: (jnp.log(x) - d.loc) / d.scale,
+    to_normal=lambda d, x: (jnp.log(jnp.maximum(x, 0)) - d.loc) / d.scale,
     tilt=lambda d, m, s: LogNormal(d.loc + d.scale * m, d.scale * s),
 )
 

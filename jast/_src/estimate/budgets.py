@@ -26,7 +26,7 @@ __all__ = [
     "uses_populations",
 ]
 
-DEFAULT_SECONDS = 8.0
+DEFAULT_SECONDS = 4.0
 """CPU seconds of simulation that a call takes by default; the rest of ten is compilation."""
 MIN_POPULATION_BUDGET = 300_000
 """Evaluations from which populations answer rather than a proposal. Of the drone, the grid and the

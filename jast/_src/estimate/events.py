@@ -138,8 +138,9 @@ def events(
         level: of the intervals (default: the estimate's).
 
     Raises:
-        ValueError: for an estimate without draws or without a failure, of another simulator, an
-            event that is no function or returns no bool, another ``of``, and a missing proposal.
+        ValueError: for an estimate without draws or without a failure, one by episodes of another
+            number of random numbers, an event that is no function or returns no bool, another
+            ``of``, and a missing proposal.
 
     Example:
         >>> import jax, jast

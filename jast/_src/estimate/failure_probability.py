@@ -126,7 +126,7 @@ def failure_probability(
     Args:
         key: consumed.
         sim: the simulator; its disturbances have quantile functions.
-        budget: episodes to simulate, at least 40. Default: what the system simulates in some eight
+        budget: episodes to simulate, at least 40. Default: what the system simulates in some four
             CPU seconds, from 300,000 to 33,554,432; 100,000 where 300,000 take more than 24. Where
             the standard error of an answer by populations or plain draws is above 5 %, or nothing
             confirms it, and 4,194,304 would do, it is made again with as many as it needs (but not

@@ -170,7 +170,7 @@ def stress(
         sim: the simulator.
         budget: evaluations (episodes; one with its gradient counts as 3 or 4) in all, nearly; of
             a black box its runs, never more, with all that the call runs; at least 300. Default:
-            what the system simulates in some eight CPU seconds, from 300,000 to 33,554,432; 200,000
+            what the system simulates in some four CPU seconds, from 300,000 to 33,554,432; 200,000
             where 300,000 take more than 24. Where the standard error of a probability by
             populations or plain draws is above 5 %, or nothing confirms it, and 4,194,304 would do,
             it is asked again with as many as it needs (but not with a ``checkpoint``). The report's

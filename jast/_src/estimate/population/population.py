@@ -136,7 +136,9 @@ def population(
             watched=(progress, callback),
             placement=placement._replace(store=store),
         )
-    return found._replace(settings=call_settings(name, key, budget=budget, level=level))
+    asked = dict(budget=budget, level=level)
+    asked |= {} if particles is None else dict(particles=particles)
+    return found._replace(settings=call_settings(name, key, **asked))
 
 
 def episodes_a_second(key: jax.Array, sim: Simulator) -> float:

@@ -228,7 +228,10 @@ def _checked_score(sim, score):
         value = jax.eval_shape(score, signature_of(sim).state)
     except Exception as error:
         raise ValueError(f"{NAME}: score raised {type(error).__name__}: {error}") from error
-    if getattr(value, "shape", None) != () or not jnp.issubdtype(value.dtype, jnp.number):
+    kinds = jnp.floating, jnp.integer
+    if getattr(value, "shape", None) != () or not any(
+        jnp.issubdtype(value.dtype, kind) for kind in kinds
+    ):
         raise ValueError(f"{NAME}: score must return a float scalar, received {shapes_text(value)}")
     return score
 
