@@ -272,3 +272,20 @@ def test_fewer_than_forty_calls_are_refused(budget):
         failure_probability(
             jax.random.key(0), limit_state(Partial(_plane, jnp.asarray(3.0)), 2), budget
         )
+
+
+@pytest.mark.parametrize("key", [0, 2])
+def test_a_failure_where_the_surrogate_was_sure_of_none_is_told(key):
+    """Fails above 3, of a distance that is 1 everywhere: the answers were 6 and 15 standard errors
+    too low without a flag.
+    """
+    sim = jast.Simulator(
+        init=lambda x0: jnp.float32(0.0),
+        step=lambda s, x: x,
+        disturbance=lambda s: D.Normal(0.0, 1.0),
+        evaluate=lambda s: (s > 3.0, jnp.float32(1.0)),
+        horizon=1,
+    )
+    found = failure_probability(jax.random.key(key), sim, 200)
+    assert not found.reliable
+    assert any("the surrogate was sure" in text for text in found.warnings)

@@ -195,6 +195,11 @@ def _reasons(learner, mean, relative, change, invalid):
             f"{int(learner.invalid.sum())} episodes are invalid (a number that is not finite): if"
             " they failed, the estimate would change"
         )
+    if learner.surprises:
+        reasons.append(
+            f"{learner.surprises} of {learner.sure} calls failed where the surrogate was sure that"
+            " none does: the miss distance jumps, or says nothing there"
+        )
     failures = int(learner.failing.sum())
     if failures < FEW_FAILURES:
         reasons.append(f"{failures} failures are too few to trust the estimate")

@@ -165,11 +165,13 @@ def fit_tilt(rows: tuple[Rows, Rows], w: np.ndarray, count: float, like: Tilt) -
     the shapes of ``like``.
     """
     w = w / w.sum() * count
-    return Tilt(*(_fit_block(r, w[r.trace], b) for r, b in zip(rows, like[:2], strict=True)))
+    return Tilt(*(_fit_block(r, w[r.trace], count, b) for r, b in zip(rows, like[:2], strict=True)))
 
 
-def _fit_block(rows, w, like):
-    """The `Block` of weighted rows, of the shapes of ``like``."""
+def _fit_block(rows, w, count, like):
+    """The `Block` of weighted rows, which count as those of ``count`` traces; of the shapes of
+    ``like``.
+    """
     if (chosen := _evenly(len(w))) is not None:
         w, rows = w[chosen] * (len(w) / ROWS), Rows(*(a[chosen] for a in rows))
     means, gates, shifts, scales = (np.zeros(a.shape) for a in like)
@@ -183,8 +185,12 @@ def _fit_block(rows, w, like):
             )
     for j in range(shifts.shape[1]):
         x = _choice_features(rows, j)
-        one_hot = np.eye(rows.log_p.shape[2])[rows.choices[:, j]]
-        shifts[:, j] = _fit_log_odds(x, one_hot, rows.log_p[:, j], w, _ridge(x.shape[1]))
+        log_p = rows.log_p[:, j]
+        p = np.exp(log_p - log_sum(log_p)[:, None])
+        target = np.eye(p.shape[1])[rows.choices[:, j]]
+        if p.shape[1] > 2:  # one more trace, of the model, so that a few do not rule out the rest
+            target = (count * target + p) / (count + 1)
+        shifts[:, j] = _fit_log_odds(x, target, log_p, w, _ridge(x.shape[1]))
     return Block(means, gates, shifts, scales)
 
 
