@@ -186,6 +186,22 @@ def _command(pid):
         return b""
 
 
+def far(disturbances):
+    away = abs(float(disturbances.sum()))
+    return away > 2.0, max(2.0 - away, 0.0)
+
+
+def test_a_worker_that_dies_while_it_has_nothing_to_do_is_replaced():
+    sim = box(far)
+    before = ends(sim, [0.0, 1.0, 0.5, 0.25])
+    for pid in processes(sim):
+        os.kill(pid, 9)
+    assert gone(processes(sim))
+    time.sleep(0.5)  # until loky knows
+    assert ends(sim, [1.5, 0.75]).tolist() == [0.5, 1.25]
+    assert before.tolist() == [2.0, 1.0, 1.5, 1.75] and not incidents(sim)
+
+
 class Broken(blackboxes.Walk):
     def initialize(self):
         os._exit(1)

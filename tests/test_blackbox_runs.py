@@ -14,6 +14,7 @@ import pytest
 
 import jast
 from jast import blackbox
+from jast._src.estimate.budgets import measure_budget
 from jast._src.runtime.host_errors import hosts_of, in_full_batches
 from jast.distributions import Normal
 from jast.incidents import incidents
@@ -350,3 +351,47 @@ def test_a_killed_call_goes_on_without_running_anything_twice(tmp_path, call):
     assert again == once
     runs = lines()
     assert len(runs) - len(set(runs)) <= 5 + CHECKED + 2 * TWICE
+
+
+def test_seconds_of_a_cheap_black_box_are_not_those_of_compilation(key):
+    """At 4 microseconds a run five seconds gave the least budget; jast's own work takes 1 ms."""
+    assert 2000 < measure_budget("stress", key, box(), 5.0, 300) <= 5000
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_likeliest_failure_is_that_of_a_mode(seed):
+    """Whoever ran it: the estimate's runs may be likelier than what refinement came to."""
+    report = jast.stress(jax.random.key(seed), box(), 300)
+    assert report.failures.best.reward == report.modes[0].failure.reward
+
+
+@pytest.mark.parametrize("name", ["stress", "failure_probability"])
+def test_ctrl_c_in_a_run_keeps_what_was_found(key, name):
+    """It comes out of a compiled program as an error of JAX."""
+    made = []
+
+    def run(disturbances):
+        made.append(0)
+        if len(made) == 250:
+            raise KeyboardInterrupt  # as its signal does, in whichever thread runs the system
+        return counted(disturbances)
+
+    sim = blackbox.from_python(run, horizon=6, disturbance=Normal(0.0, 1.0))
+    if name == "stress":
+        assert "interrupted" in jast.stress(key, sim, 400).settings
+    else:
+        found = jast.estimate.failure_probability(key, sim, budget=300)
+        assert any("interrupted" in text for text in found.warnings)
+
+
+def test_an_error_that_cannot_say_what_it_is(key):
+    class Silent(Exception):
+        def __str__(self):
+            raise RuntimeError("no words")
+
+    def run(disturbances):
+        raise Silent
+
+    sim = blackbox.from_python(run, horizon=2, disturbance=Normal(0.0, 1.0))
+    jast.rollout(key, sim)
+    assert incidents(sim)[0].message.startswith("raised Silent")

@@ -510,3 +510,16 @@ def test_a_validation_of_0_2_0_goes_on():
         KEY, predict, inputs, labels, budget=25, selector="random", state=state
     )
     assert found.calls == 25 and list(found.order[:20]) == list(arrays["order"])
+
+
+def test_a_folder_that_is_missing_is_named(tmp_path, key):
+    episode = jast.rollout(key, jast.simulators.walk1d())
+    with pytest.raises(FileNotFoundError, match="no such folder.*nowhere'"):
+        jast.save(tmp_path / "nowhere" / "episode.npz", episode)
+
+
+def test_names_with_points_keep_their_own_arrays(tmp_path):
+    path, result = tmp_path / "points", {"a.b": np.zeros(1), "a": {"b": np.ones(1)}}
+    jast.save(path, result)
+    found = jast.load(path)
+    assert found["a.b"] == 0 and found["a"]["b"] == 1

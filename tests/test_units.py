@@ -494,6 +494,62 @@ def test_a_fingerprint_tells_functions_and_numbers_apart():
     assert "sim" in describe_differences(fingerprint(sim=walk1d()), fingerprint(sim=ferry()))
 
 
+def test_a_fingerprint_tells_what_functions_are_given():
+    class Plant:
+        def __init__(self, gain):
+            self.gain = gain
+            self.calls = 0
+
+        def step(self, x):
+            self.calls += 1
+            return self.gain * x
+
+    class Other:
+        def step(self, x):
+            return x
+
+    def made(gain):
+        def step(x, gain=gain, *, offset=gain):
+            return gain * x + offset
+
+        return step
+
+    def unlike(a, b):
+        return describe_differences(fingerprint(f=a), fingerprint(f=b))
+
+    assert "f.0 is 2.0 there, 3.0 here" in unlike(made(2.0), made(3.0))
+    used = Plant(2.0)
+    used.step(1.0)
+    assert not unlike(Plant(2.0).step, used.step)
+    assert unlike(Plant(2.0).step, Plant(3.0).step) == "f.gain is 2.0 there, 3.0 here"
+    plants = [type("Plant", (), dict(step=step)) for step in (Plant.step, Other.step)]
+    assert "f.step" in unlike(*plants)
+    words = [f"def f(x): return x in {{{names}}}" for names in ("'a', 'b', 'c'", "'c', 'b', 'a'")]
+    sets = [{}, {}]
+    for text, names in zip(words, sets, strict=True):
+        exec(text, names)
+    assert not unlike(*(names["f"] for names in sets))
+
+
+def test_a_black_box_of_another_system_is_another_call(key, tmp_path):
+    def box(limit):
+        run = lambda x: (bool(x.sum() > limit), float(max(limit - x.sum(), 0.0)))
+        return jast.blackbox.from_python(
+            run, horizon=3, disturbance=jast.distributions.Normal(0.0, 1.0)
+        )
+
+    jast.nominal(key, box(5.0), 20, checkpoint=tmp_path)
+    with pytest.raises(ValueError, match="another call: .*system"):
+        jast.nominal(key, box(2.0), 20, checkpoint=tmp_path)
+
+
+def test_nothing_is_deleted_from_a_folder_of_other_files(key, tmp_path):
+    (tmp_path / "film.part").write_text("mine")
+    with pytest.raises(ValueError, match="holds other files"):
+        jast.nominal(key, walk1d(), 20, checkpoint=tmp_path)
+    assert [p.name for p in tmp_path.iterdir()] == ["film.part"]
+
+
 # --- long: processes, devices, many kills
 
 

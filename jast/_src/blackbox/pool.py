@@ -9,6 +9,7 @@ import time
 import weakref
 from collections import deque
 from concurrent.futures import FIRST_COMPLETED, wait
+from multiprocessing.util import Finalize
 from typing import NamedTuple
 
 import numpy as np
@@ -121,12 +122,15 @@ class Pool:
     of a process.
     """
 
-    def __init__(self, payload, workers, spec, x=0, size=0):
-        self.payload, self.spec = payload, spec
+    def __init__(self, payload, workers, spec, x=0, size=0, system=None):
+        """``system``: what the payload holds, for the fingerprint of a call."""
+        self.payload, self.spec, self.system = payload, spec, system
         self.workers = [Worker(payload) for _ in range(workers)]
         self.configure(x, size)
         self.pace: float | None = None  # seconds a row
         weakref.finalize(self, _close, self.workers)
+        # at the end of a process of an executor no finalizer of weakref runs
+        Finalize(None, _close, (self.workers,), exitpriority=100)
 
     def __reduce__(self):  # another process has workers of its own
         return Pool, (self.payload, len(self.workers), self.spec, self.x, self.size)
@@ -179,7 +183,12 @@ class Pool:
                 for w, queue, rows in given:
                     longest = t[rows].max()
                     leaves = [a[rows] for a in x0], [a[rows, :longest] for a in xs]
-                    task = w.executor.submit(SERVE, t[rows], *leaves)
+                    try:
+                        task = w.executor.submit(SERVE, t[rows], *leaves)
+                    except Exception:  # it died while it had nothing to do
+                        w.kill()
+                        self._start([w])
+                        task = w.executor.submit(SERVE, t[rows], *leaves)
                     busy[task] = _Piece(w, queue, rows, self._deadline(t[rows]))
                     free.remove(w)
                 first = min(piece.deadline for piece in busy.values())

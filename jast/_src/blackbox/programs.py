@@ -58,7 +58,8 @@ def program(command: str | Sequence[str], *, folder: PathLike | None = None) -> 
     """A system for `from_python` that runs an external program, once for each episode.
 
     The program reads one JSON object from standard input, ``{"x0": ..., "disturbances": [...]}``
-    (the horizon's rows; lists and objects as the disturbance is; x0 is null with one start). It
+    (one row a step; of a `Joint` of a and b an object of such lists, ``{"a": [...], "b": [...]}``;
+    x0 is null with one start). It
     prints ``{"event": false, "distance": 1.5}`` as the last line of its standard output. Another
     exit status than 0, another last line, and no answer within a time limit are incidents, not
     errors.

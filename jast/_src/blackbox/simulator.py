@@ -228,7 +228,9 @@ def from_python(
     disturbance = D.seeds() if disturbance is None else accepted(disturbance)
     tells = likelihood or ("maybe" if isinstance(disturbance, Seeds) and not run else None)
     spec = Spec(run, episodic, horizon, _structure("x0", like0), random, time_limit, tells)
-    runner = Pool(pack(system, spec), workers, spec) if workers else Runner(system, spec)
+    runner = (
+        Pool(pack(system, spec), workers, spec, system=system) if workers else Runner(system, spec)
+    )
     size = 0 if run else _observed_numbers(runner, start, limited=observe is None)
 
     constant = D.is_distribution(disturbance)

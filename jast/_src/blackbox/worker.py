@@ -416,7 +416,10 @@ def said(error):
     """(kind, message) of what the system raised."""
     if isinstance(error, TimedOut | WrongAnswer | NotANumber):
         return error.kind, str(error)
-    text = " ".join(str(error).split())[:200]
+    try:
+        text = " ".join(str(error).split())[:200]
+    except Exception:  # the system's own exception cannot say what it is
+        text = ""
     return "raised", f"raised {type(error).__name__}{f': {text}' if text else ''}{line_of(error)}"
 
 

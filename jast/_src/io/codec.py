@@ -237,6 +237,8 @@ def _array(value: Any, arrays: dict[str, np.ndarray], at: str) -> dict[str, str]
         raise ValueError(f"save: {at} must be numbers, received a key: keep its key_data")
     if value.dtype.kind in "OSU":
         raise ValueError(f"save: {at} must be an array of numbers, received {value.dtype}")
+    while at in arrays:  # a name with a point in it may look like a path
+        at += "'"
     arrays[at] = np.asarray(value)
     return {"number" if isinstance(value, np.generic) else "array": at}
 

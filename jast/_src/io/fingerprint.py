@@ -2,6 +2,7 @@
 functions by name and code, settings and versions.
 """
 
+import contextlib
 import dataclasses
 import hashlib
 import inspect
@@ -14,10 +15,13 @@ from typing import Any
 import jax
 import numpy as np
 
+from jast._src.runtime.host_errors import Asking
 from jast._src.util.pytrees import fields_of
 
 __all__ = ["describe_differences", "fingerprint", "versions"]
 
+OURS = "jast.", "jax."
+"""Modules whose versions say what their functions are."""
 NAMED = 3  # differences that a message names: more would hide the first
 
 
@@ -25,8 +29,9 @@ def fingerprint(**parts: Any) -> dict[str, str]:
     """``parts`` as a flat dict "part.field.field" -> words, with the versions that results depend
     on.
 
-    Arrays enter by their type, shape and a hash of their values, functions by their name and code
-    and what they close over, other objects by their class alone.
+    Arrays enter by their type, shape and a hash of their values, functions by their name and code,
+    their defaults, what they close over and the floats of what they are bound to, classes by the
+    code of their methods, black boxes by their system, other objects by their class alone.
     """
     found = versions() | {
         "python": "{}.{}".format(*sys.version_info),
@@ -88,11 +93,20 @@ def _describe(name: str, value: Any, above: tuple) -> Iterator[tuple[str, str]]:
     elif dataclasses.is_dataclass(value) and not isinstance(value, type):
         yield name, type(value).__qualname__
         yield from inside(fields_of(value).items())
+    elif isinstance(value, Asking):
+        host = value.host
+        yield from _of_function(name, value.function, above)
+        yield from inside([("spec", host.spec)])
+        yield from _describe(f"{name}.system", host.runner.system, (*above, Asking))
     elif inspect.isroutine(function := inspect.unwrap(value) if callable(value) else value):
         yield from _of_function(name, function, above)
     else:
         kind = value if isinstance(value, type) else type(value)
-        yield name, f"{kind.__module__}.{kind.__qualname__}"
+        words = f"{kind.__module__}.{kind.__qualname__}"
+        yield name, words
+        if isinstance(value, type) and not words.startswith(OURS):
+            methods = {k: m for k, m in vars(kind).items() if inspect.isfunction(m)}
+            yield from inside(sorted(methods.items()))
 
 
 def _of_array(array: np.ndarray) -> str:
@@ -102,26 +116,46 @@ def _of_array(array: np.ndarray) -> str:
 
 
 def _of_function(name: str, function: Any, above: tuple) -> Iterator[tuple[str, str]]:
-    function = getattr(function, "__func__", function)
+    bound, function = getattr(function, "__self__", None), getattr(function, "__func__", function)
     words = f"{getattr(function, '__module__', '')}.{function.__qualname__}"
     code = getattr(function, "__code__", None)
-    ours = words.startswith(("jast.", "jax."))  # their versions say what they are
+    ours = words.startswith(OURS)  # their versions say what they are
     if code is None or ours or function in above:
         yield name, words
     else:
         yield name, f"{words} with code {_of_code(code).hexdigest()[:12]}"
-    if code is not None and function not in above:
-        for variable, cell in zip(code.co_freevars, function.__closure__ or ()):
-            try:
-                held = cell.cell_contents
-            except ValueError:  # not yet assigned
-                continue
-            yield from _describe(f"{name}.{variable}", held, (*above, function))
+    if code is None or function in above:
+        return
+    held = [*enumerate(function.__defaults__ or ()), *(function.__kwdefaults__ or {}).items()]
+    held += _floats_of(bound)
+    for variable, cell in zip(code.co_freevars, function.__closure__ or ()):
+        with contextlib.suppress(ValueError):  # not yet assigned
+            held.append((variable, cell.cell_contents))
+    for key, part in held:
+        # a black box may count its runs, or keep things between them
+        if Asking not in above or _is_fixed(part):
+            yield from _describe(f"{name}.{key}", part, (*above, function))
+
+
+def _is_fixed(held: Any) -> bool:
+    """Whether this is something that a run does not change: no counter, list or object."""
+    kinds = float | str | bytes | np.ndarray | np.generic | jax.Array | type | partial
+    return isinstance(held, kinds) or inspect.isroutine(held)
+
+
+def _floats_of(bound: Any) -> list[tuple[str, Any]]:
+    """The attributes of an object that are floats or arrays: others may be counters."""
+    if isinstance(bound, type | types.ModuleType) or not hasattr(bound, "__dict__"):
+        return []
+    kinds = float | np.ndarray | np.generic | jax.Array
+    return [(k, v) for k, v in sorted(vars(bound).items()) if isinstance(v, kinds)]
 
 
 def _of_code(code: types.CodeType) -> Any:
     digest = hashlib.sha256(code.co_code)
     for part in (*code.co_names, *code.co_consts):
+        if isinstance(part, frozenset):  # of no fixed order
+            part = sorted(map(repr, part))
         inner = isinstance(part, types.CodeType)
         digest.update(_of_code(part).digest() if inner else repr(part).encode())
     return digest

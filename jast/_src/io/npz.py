@@ -19,6 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jast._src.core.typing import PathLike
+from jast._src.io.atomic import replacing
 
 __all__ = ["pack", "read", "unpack", "write"]
 
@@ -41,19 +42,12 @@ def write(
     write is not compressed and does not wait for the disk, so it survives the end of the process
     but perhaps not a crash of the machine.
     """
-    path = os.fspath(path)
-    part = f"{path}.{os.getpid()}.part"
     entries = _entries(format, version, header, arrays)
-    try:
-        with open(part, "wb") as file:
-            (np.savez if quick else np.savez_compressed)(file, **entries)
-            file.flush()
-            if not quick:
-                os.fsync(file.fileno())
-        os.replace(part, path)
-    finally:
-        if os.path.exists(part):
-            os.unlink(part)
+    with replacing(path) as file:
+        (np.savez if quick else np.savez_compressed)(file, **entries)
+        file.flush()
+        if not quick:
+            os.fsync(file.fileno())
 
 
 def pack(format: str, version: int, header: Header, arrays: Arrays) -> bytes:

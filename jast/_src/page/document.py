@@ -11,6 +11,8 @@ from typing import Any
 import jax
 import numpy as np
 
+from jast._src.io.atomic import replacing
+
 __all__ = ["document", "plain", "rows", "table", "text", "write"]
 
 HERE = Path(__file__).parent
@@ -56,14 +58,8 @@ def write(path: str | os.PathLike, page: str) -> None:
     """Write ``page`` to a file. The write is atomic: an existing file is replaced only once the new
     one is complete.
     """
-    path = os.fspath(path)
-    part = f"{path}.{os.getpid()}.part"
-    try:
-        Path(part).write_text(page, encoding="utf-8", newline="\n")
-        os.replace(part, path)
-    finally:
-        if os.path.exists(part):
-            os.unlink(part)
+    with replacing(path, "w", encoding="utf-8", errors="backslashreplace", newline="\n") as file:
+        file.write(page)
 
 
 def embedded(data: Any) -> str:

@@ -117,6 +117,14 @@ def _compiled(function, wanted, how, options):
         return jax.jit(function, compiler_options=dict(known) or None, **options)
 
     def run(*args, **kwargs):
+        try:
+            return call(*args, **kwargs)
+        except Exception as error:
+            if was_interrupted(error):
+                raise KeyboardInterrupt from error
+            raise
+
+    def call(*args, **kwargs):
         # inside of another program there are no options of its own
         if not wanted() or is_tracing() or is_traced(args, kwargs):
             return whole(*args, **kwargs)
@@ -152,8 +160,10 @@ def reset_cache() -> None:
 
 def was_interrupted(error: BaseException) -> bool:
     """Whether ``error`` is a KeyboardInterrupt, or what JAX makes of one that met a callback."""
-    met = isinstance(error, jax.errors.JaxRuntimeError) and "KeyboardInterrupt" in str(error)
-    return met or isinstance(error, KeyboardInterrupt)
+    # a compiled call raises a ValueError, later uses of its values a JaxRuntimeError
+    of_jax = isinstance(error, jax.errors.JaxRuntimeError)
+    of_jax |= isinstance(error, ValueError) and "Callback" in str(error)
+    return isinstance(error, KeyboardInterrupt) or of_jax and "KeyboardInterrupt" in str(error)
 
 
 def host_call(

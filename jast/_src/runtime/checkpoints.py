@@ -224,11 +224,12 @@ def open_checkpoint(
     if folder.exists() and not folder.is_dir():
         raise ValueError(f"{function}: checkpoint must be a folder, received the file {folder}")
     with contextlib.ExitStack() as stack:
+        _require_own(function, folder)
         with _name_errors(function, folder):
             folder.mkdir(parents=True, exist_ok=True)
             lock = stack.enter_context(open(folder / "lock", "a+"))
         _lock(function, folder, lock)
-        for part in folder.glob("*.part"):  # of a process that was killed while it wrote
+        for part in folder.glob("*.jast.*.part"):  # of a process that was killed while it wrote
             part.unlink()
         _require_same_call(function, folder, fingerprint(function=function, key=key, **about))
         with _name_errors(function, folder):
@@ -239,15 +240,22 @@ def open_checkpoint(
         yield checkpoint
 
 
+def _require_own(function: str, folder: Path) -> None:
+    """ValueError for a folder of other files, in which nothing is changed."""
+    if not folder.exists() or (folder / "about.jast").exists():
+        return
+    names = [p.name for p in folder.iterdir() if p.name != "lock"]
+    if others := [n for n in names if not (n.startswith("about.jast.") and n.endswith(".part"))]:
+        raise ValueError(
+            f"{function}: checkpoint {folder} holds other files, such as {min(others)}:"
+            " give another folder"
+        )
+
+
 def _require_same_call(function: str, folder: Path, about: dict[str, str]) -> None:
     """ValueError unless the folder is new or its call was ``about`` the same."""
     path = folder / "about.jast"
     if not path.exists():
-        if others := [p.name for p in folder.iterdir() if p.name != "lock"]:
-            raise ValueError(
-                f"{function}: checkpoint {folder} holds other files, such as {min(others)}:"
-                " give another folder"
-            )
         with _name_errors(function, folder):
             return npz.write(path, ABOUT, VERSION, dict(about=about), {})
     header, _ = npz.read(path, {ABOUT: VERSION}, "a checkpoint")

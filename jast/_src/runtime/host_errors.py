@@ -28,6 +28,7 @@ __all__ = [
     "runs_apart",
     "runs_made",
     "runs_on_host",
+    "seconds_of_runs",
     "telling_runs",
 ]
 
@@ -150,6 +151,11 @@ def runs_on_host(sim):
 def runs_made(sim):
     """How often the host code behind a simulator has started to run so far: 0 of one in JAX."""
     return sum(host.done.episodes for host in hosts_of(sim))
+
+
+def seconds_of_runs(sim):
+    """How long this host code has taken so far, without the compilation of what calls it."""
+    return sum(host.done.seconds for host in hosts_of(sim))
 
 
 def failing_runs(sim):
