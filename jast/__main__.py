@@ -67,6 +67,8 @@ def main(argv=None):
         parser.error("argument --method: a system of your own has stress, no other")
     if options.method == "stress" and a_search:
         parser.error("argument --budget: stress has a budget; the other counts are of searches")
+    if options.method != "stress" and options.budget is not None:
+        parser.error("argument --budget: only of stress; a search has --trees and --simulations")
     for name, methods in OPTIONS:
         if getattr(options, name) and options.method not in methods:
             parser.error(
@@ -171,6 +173,8 @@ def _count(text):
 def _load(parser, place):
     """The simulator at FILE.py:NAME."""
     file, _, name = place.rpartition(":")
+    if not file and Path(name).is_file():
+        parser.error(f"argument FILE.py:NAME: name the simulator, too, as in {name}:sim")
     if not Path(file).is_file():
         parser.error(f"argument FILE.py:NAME: there is no file {file!r}")
     spec = importlib.util.spec_from_file_location(Path(file).stem, file)

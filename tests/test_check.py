@@ -524,3 +524,33 @@ def test_no_key_is_used_twice(key):
         keys = jax.random.split(key, 2)
         assert jast.rollout(keys[0], sim).length == 21
         assert jast.nominal(keys[1], sim, episodes=10).episodes == 10
+
+
+@pytest.mark.parametrize(
+    "parts",
+    [
+        dict(evaluate=lambda s: (s > 6, 1.0)),
+        dict(init=lambda x0: 0.0, evaluate=lambda s: (s > 6, 6.0 - s)),
+        dict(
+            init=lambda x0: (0.0, 0.0),
+            step=lambda s, x: (0.9 * s[0] + x, s[1] + 1.0),
+            evaluate=lambda s: (s[0] > 6, 1.0),
+        ),
+    ],
+)
+def test_numbers_of_python_are_numbers(parts, key):
+    sim = dataclasses.replace(line(), **parts)
+    assert jast.check(sim) is sim
+    assert jast.estimate.failure_probability(key, sim, 5000).episodes == 5000
+
+
+@pytest.mark.parametrize("name", ["init", "step"])
+def test_a_forgotten_return_is_named(name):
+    with pytest.raises(ValueError, match=f"{name}: returned None: is a return missing"):
+        jast.check(dataclasses.replace(line(), **{name: lambda *given: None}))
+
+
+def test_a_start_that_was_not_given_is_named():
+    sim = dataclasses.replace(line(), init=lambda x0: x0 + 0.0)
+    with pytest.raises(ValueError, match=r"init: raised TypeError.*as start is not given"):
+        jast.check(sim)

@@ -89,7 +89,6 @@ def test_nothing_lies_outside_of_the_support(name, dtype):
             assert float(D.cdf(d, x)) == below
 
 
-
 def mapped(function, values):
     return np.asarray(jax.jit(jax.vmap(function))(values))
 

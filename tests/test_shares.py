@@ -206,7 +206,7 @@ def test_a_share_in_words_and_in_files(key):
     first = first._replace(share=0.524, share_interval=(0.491, 0.551))
     text = str(Modes([first, second]))
     assert "52 % [49, 56]" in text and max(map(len, text.splitlines())) < 64
-    assert first._replace(share_interval=UNKNOWN).share_words == "52 %"
+    assert first._replace(share_interval=UNKNOWN).share_words == "52 % of members"
     assert first._replace(share=1.0, share_interval=(1.0, 1.0)).share_words == "100 %"
     arrays, bare = {}, first._replace(failure=None)
     node = codec.encode(bare, arrays)

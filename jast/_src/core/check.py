@@ -45,6 +45,7 @@ HINTS = {
     "TracerArrayConversionError": " Use jax.numpy in place of numpy",
     "ConcretizationTypeError": " Use jax.numpy in place of float, int and math",
 }
+NO_START = ". Its argument is (), as start is not given: start=lambda: Normal(0.0, 1.0) draws one"
 KEY = (
     ". Noise from a key in the state is the same in every episode: draw it in disturbance or start,"
     " which may also be the seed of a key (jast.distributions.seeds). To keep the key all the same,"
@@ -70,7 +71,8 @@ def check(sim: Simulator, actions: Actions | None = None) -> Simulator:
 
      - the floats of the state are too coarse for what a disturbance does to it, or no disturbance
        changes a number of the state;
-     - the state jumps back to its start, as of an environment that resets itself;
+     - the state jumps back to its start, three times as far as it ever moved in a step, as of an
+       environment that resets itself;
      - the state holds a random key that no disturbance reaches;
      - `jax.lax.stop_gradient` leaves the miss distance without a slope;
      - the step is so large that it takes minutes to compile.
@@ -185,14 +187,16 @@ def _trace(function, sim, actions, observed):
 
 def _call(name, function, *args):
     try:
-        return function(*args)
+        found = function(*args)
     except Exception as e:
         from jast._src.blackbox.worker import line_of
 
         kind = type(e).__name__
-        raise ValueError(
-            f"{name}: raised {kind}{line_of(e)}: {_first_line(e)}{HINTS.get(kind, '')}"
-        ) from e
+        hint = HINTS.get(kind, NO_START if name == "init" and args == ((),) else "")
+        raise ValueError(f"{name}: raised {kind}{line_of(e)}: {_first_line(e)}{hint}") from e
+    if found is None and name in ("init", "step"):
+        raise ValueError(f"{name}: returned None: is a return missing?")
+    return found
 
 
 def _draw(name, dist):

@@ -187,7 +187,7 @@ def _five_paths(sim: Simulator, steps: int, keys: jax.Array) -> tuple[Any, ...]:
 
     def evaluate(state):
         event, distance, *_ = sim.evaluate(state)
-        return event | sim.is_terminal(state), distance
+        return event | sim.is_terminal(state), jnp.asarray(distance)
 
     def body(paths):
         states, x = jax.vmap(step, (0, None, 0))(which, paths.t, paths.states)

@@ -39,7 +39,7 @@ class Independent(Distribution):
         if not (isinstance(event, tuple) and all(isinstance(i, int) for i in event)):
             raise ValueError(
                 f"Independent: distribution: expected one of arrays, received {_name(distribution)}"
-                f" with event shape {event!r}"
+                f" with event shape {event!r}; wrap its parts instead"
             )
         ndim = len(distribution.batch_shape)
         n = max(ndim - 1, 0) if n is None else n
@@ -112,7 +112,10 @@ class Joint(Distribution):
         batches = {d.batch_shape for d in leaves(self._distributions)}
         if len(batches) > 1:
             each = ", ".join(f"{_name(d)} {d.batch_shape}" for d in leaves(self._distributions))
-            raise ValueError(f"Joint: expected one batch shape, received {each}")
+            raise ValueError(
+                f"Joint: expected one batch shape, received {each}; a part that is a vector is"
+                " Independent(part, 1)"
+            )
 
     @property
     def distributions(self) -> Any:

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 
 from jast._src.core.typing import Array, DistributionLike, Numeric, PRNGKey
 from jast._src.distributions.base import Distribution, as_key, float_array
-from jast._src.distributions.normal_tails import fraction
+from jast._src.distributions.normal_tails import float_dtype, fraction
 from jast._src.distributions.operations import log_density, mode
 
 __all__ = ["Deterministic", "Fixed", "Seeds", "Tent", "Where", "seeds", "tent", "where"]
@@ -79,6 +79,18 @@ class Deterministic(_WithoutDensity):
 
     def mode(self) -> Any:
         return self._value
+
+    def from_normal(self, z: Any) -> Any:
+        return self._value
+
+    quantile = from_normal
+
+    def cdf(self, value: Any) -> Any:
+        return jax.tree.map(lambda x, a: (x >= a).astype(float_dtype(x.dtype)), value, self._value)
+
+    def to_normal(self, value: Any) -> Any:
+        """0: whatever it is decides nothing."""
+        return jax.tree.map(lambda x: jnp.zeros(jnp.shape(x), float_dtype(x.dtype)), value)
 
 
 class Seeds(_WithoutDensity):

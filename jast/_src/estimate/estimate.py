@@ -234,8 +234,8 @@ def flag_imprecise(found: Estimate) -> Estimate:
     enough = found.episodes * (found.relative_error / MAX_RELATIVE_ERROR) ** 2
     text = (
         f"{IMPRECISE} {found.relative_error:.2g}, above {MAX_RELATIVE_ERROR}: the"
-        f" interval is too wide for an answer, and some {enough:.1g} evaluations would narrow it to"
-        " that"
+        " interval is too wide for an answer, and it takes at least"
+        f" {enough:.1g} evaluations to narrow it to that"
     )
     return found._replace(reliable=False, warnings=(text, *found.warnings))
 

@@ -61,7 +61,7 @@ class Minimal(NamedTuple):
         count = f"{len(self.parts)} of {self.numbers} disturbances {are} needed"
         lines = [f"{count}: {_steps_in_words(steps)}"]
         lines += [
-            f"  step {step:4d}  {name:<12} {value:12.5g}   {z:+.2f} from the mode"
+            f"  step {step:4d}  {name:<12} {value:12.5g}   {z:+.2f} sd from the mode"
             for step, name, value, z in self.parts[:PRINTED]
         ]
         if len(self.parts) > PRINTED:

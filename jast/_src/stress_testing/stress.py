@@ -44,7 +44,7 @@ from jast._src.runtime.host_errors import (
     telling_runs,
 )
 from jast._src.runtime.progress_bar import Watch
-from jast._src.search.refine.modes import Mode, Modes, modes, spread
+from jast._src.search.refine.modes import Mode, Modes, modes, owners, spread
 from jast._src.search.refine.refine import refine
 from jast._src.stress_testing.explorers import (
     EXPLORERS,
@@ -67,7 +67,8 @@ MIN_BUDGET = 300
 DEFAULT_BUDGET = 200_000
 """Evaluations by default where populations are not the answer."""
 REDRAWN_EPISODES = 400
-"""Draws of the estimate's proposal, where only it found failures."""
+"""Draws of the estimate's proposal, where only it found failures, but no more than all batches
+together may have of a small budget."""
 REDRAWN_BATCHES = 20
 """Of so many draws at most, until one fails: of the ferry's proposal with 20,000 evaluations (key
 0) that was one of the seventh batch."""
@@ -548,7 +549,10 @@ class _StressTest:
             if _best_log_density(found) > _best_log_density(self.failures):
                 self.residual = self.late = np.nan  # those of another failure
             self.failures = merge(self.failures, found, top=self.top)
-            self.note("failing runs kept", 0)
+            best = _best_log_density(found)
+            if self.modes:
+                self.modes = _with_likelier(self.sim, self.modes, found)
+            self.note("failing runs kept", 0, best=best)
 
     def redraw_failures(self, q):
         """Failures that the estimate's proposal draws, where the search found none; a few draws of
@@ -556,11 +560,12 @@ class _StressTest:
         """
         most = REDRAWN_BATCHES if self.probability.failing and not self.hosted else 1
         failing, batches = np.zeros(1, bool), 0
+        each = min(REDRAWN_EPISODES, max(self.budget // REDRAWN_BATCHES, 1))
         while not failing.any() and batches < most:
-            points, drawn, _ = redraw(self.next_key(), self.sim, q, REDRAWN_EPISODES)
+            points, drawn, _ = redraw(self.next_key(), self.sim, q, each)
             failing, batches = np.asarray(drawn.failure), batches + 1
         result = failures_at(self.sim, np.asarray(points)[failing])
-        evaluations = batches * REDRAWN_EPISODES + result.evaluations
+        evaluations = batches * each + result.evaluations
         self.add_failures("the estimate's failures", result._replace(evaluations=evaluations))
         self.refine()
 
@@ -592,6 +597,18 @@ class _StressTest:
             settings=settings,
             sim=self.sim,
         )
+
+
+def _with_likelier(sim: Simulator, found: Modes, failures: Failures) -> Modes:
+    """The modes with the ``failures`` that are likelier than those of the modes in whose direction
+    they lie.
+    """
+    heads = [m.failure for m in found]
+    for e, k in zip(failures, owners(sim, failures.episodes, stacked(heads)), strict=True):
+        if float(e.reward) > float(heads[k].reward):
+            heads[k] = e
+    kept = [m._replace(failure=e) for m, e in zip(found, heads, strict=True)]
+    return Modes(sorted(kept, key=lambda m: -float(m.failure.reward)), found.evaluations)
 
 
 def _best_log_density(failures: Failures) -> float:
