@@ -476,3 +476,16 @@ def test_the_example_of_a_table_runs(tmp_path, monkeypatch, key, capsys):
     assert len(code.strip().splitlines()) <= 10
     exec(code, dict(MySimulator=MySimulator))
     assert capsys.readouterr().out == "True\n"
+
+
+def test_what_is_no_archive_is_named(key, tmp_path):
+    sim = jast.simulators.walk1d()
+    report = jast.stress(key, sim, 1000)
+    with pytest.raises(ValueError, match="replay: episode must be one Episode, .*received Report"):
+        jast.replay(sim, report)
+    with pytest.raises(ValueError, match="replay: episode must be one .*received Failures"):
+        jast.replay(sim, report.failures)
+    with pytest.raises(ValueError, match="failures must be an archive .*received Report"):
+        jast.failures.to_csv(tmp_path / "table.csv", report)
+    with pytest.raises(ValueError, match="merge: b must be an archive .*received int"):
+        jast.failures.merge(report.failures, 3)

@@ -156,7 +156,8 @@ def replay(
         `Episode` with its states.
 
     Raises:
-        ValueError: where the disturbances do not fit the simulator.
+        ValueError: for a report or an archive in place of one episode, and where the disturbances
+            do not fit the simulator.
 
     Example:
         >>> import jax.numpy as jnp, jast
@@ -165,6 +166,11 @@ def replay(
         (True, 5)
     """
     require_simulator("replay", sim)
+    if hasattr(episode, "failures") or hasattr(episode, "episodes"):
+        raise ValueError(
+            "replay: episode must be one Episode, such as report.failures[0], received"
+            f" {type(episode).__name__}"
+        )
     disturbances, length = episode, None
     if isinstance(episode, Episode):
         disturbances, x0, length = episode.disturbances, episode.x0, episode.length

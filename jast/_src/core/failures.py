@@ -273,7 +273,8 @@ def merge(a: Failures, b: Failures, top: int = 64) -> Failures:
         top: distinct failures kept.
 
     Raises:
-        ValueError: where the shapes of the two disagree, or ``top`` is below 1.
+        ValueError: for what is no archive, where the shapes of the two disagree, or ``top`` is
+            below 1.
 
     Example:
         >>> import jax, jast
@@ -284,6 +285,12 @@ def merge(a: Failures, b: Failures, top: int = 64) -> Failures:
         >>> int(both.seen) == int(a.seen + b.seen)
         True
     """
+    for name, given in (("a", a), ("b", b)):
+        if not isinstance(given, Failures):
+            raise ValueError(
+                f"merge: {name} must be an archive of jast.failures, as report.failures, received"
+                f" {type(given).__name__}"
+            )
     trees = [jax.tree.structure(f.episodes) for f in (a, b)]
     shapes = [[np.shape(leaf)[1:] for leaf in jax.tree.leaves(f.episodes)] for f in (a, b)]
     if trees[0] != trees[1] or shapes[0] != shapes[1]:

@@ -36,6 +36,9 @@ def to_numpy(failures: Any) -> dict[str, np.ndarray]:
         nothing; with a random start ``x0`` [n, ...]. Where a disturbance is a structure, each of
         its arrays has its own entry, as "x.gust" or "x.0".
 
+    Raises:
+        ValueError: for what is no such archive.
+
     Example:
         >>> import jax, jast
         >>> sim = jast.simulators.walk1d()
@@ -43,6 +46,11 @@ def to_numpy(failures: Any) -> dict[str, np.ndarray]:
         >>> jast.failures.to_numpy(found)["x"].shape == (len(found), 30)
         True
     """
+    if not isinstance(getattr(failures, "episodes", None), Episode):  # a report counts its own
+        raise ValueError(
+            "failures must be an archive of jast.failures, as report.failures, received"
+            f" {type(failures).__name__}"
+        )
     e = jax.tree.map(np.asarray, failures.episodes)
     out = {name: getattr(e, name) for name in OF_EPISODE}
     for root, part in (("x0", e.x0), ("x", e.disturbances)):
@@ -73,6 +81,9 @@ def to_csv(path: PathLike, failures: Any) -> None:
     Args:
         path: of the file; an older one of that name is replaced.
         failures: a `jast.failures.Failures`.
+
+    Raises:
+        ValueError: for what is no such archive.
 
     Example:
         >>> import os, tempfile, jax, jast
