@@ -118,8 +118,10 @@ class Uniform(Elementwise):
 
 def log_power(x: Array, k: Array) -> Array:
     """The log of x^k, which is 0 for k = 0 at x = 0, too; -inf for x < 0, outside of a support."""
-    safe = jnp.where(((k == 0) & (x == 0)) | (x < 0), 1, x)
-    return jnp.where(x < 0, -jnp.inf, k * jnp.log(safe))
+    outside, zero = x < 0, k == 0
+    x = jnp.where(zero & (x == 0), 1, jnp.where(outside, jnp.where(k < 0, jnp.inf, 0), x))
+    # last of all the product: what is added to it then rounds as in other libraries
+    return jnp.where(zero & outside, 1, k) * jnp.log(x)
 
 
 class _Pair(Elementwise):
