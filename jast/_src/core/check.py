@@ -27,7 +27,7 @@ from jast._src.core.typing import Actions, Array, ArrayTree
 from jast._src.runtime._jax import is_traced, is_tracing, quick
 from jast._src.runtime.host_errors import incidents, new_incidents, runs_on_host
 from jast._src.runtime.memory import release
-from jast._src.util.pytrees import select
+from jast._src.util.pytrees import select, with_rows_of
 
 __all__ = ["ACTIONS", "OBSERVED", "check", "contract"]
 
@@ -140,7 +140,10 @@ def contract(function, sim, actions=None, observed=0):
         if not callable(getattr(sim, name)):
             raise ValueError(f"{name}: expected a function, received {getattr(sim, name)!r}")
     release()  # here, as whatever compiles much for a simulator comes by first
-    jax.eval_shape(lambda: _trace(function, sim, actions, observed))
+    kept, asked = vars(sim).setdefault("_contracts", set()), (jax.config.jax_enable_x64, observed)
+    if actions is not None or asked not in kept:
+        jax.eval_shape(lambda: _trace(function, sim, actions, observed))
+        kept.add(asked)
     return sim
 
 
@@ -352,9 +355,9 @@ def _probe(sim, actions):
         first = _arrays("init", sim.init(x0))
         done, flags = look(first)
         steps = sim.horizon if sim.episodic else min(sim.horizon, STEPS)
-        (last, _), (later, xs) = lax.scan(
-            step, (first, jnp.zeros((), bool)), jnp.arange(1, steps + 1, dtype=jnp.int32)
-        )
+        begun = with_rows_of(undisturbed, (first, jnp.zeros((), bool)))
+        times = jnp.arange(1, steps + 1, dtype=jnp.int32)
+        (last, _), (later, xs) = lax.scan(step, begun, times)
         flags = (~jnp.isfinite(start.log_prob(x0)), *flags)
         density, nan, distance = jax.tree.map(
             lambda a, b: jnp.concatenate([a[None], b]), flags, later

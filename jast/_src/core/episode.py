@@ -24,7 +24,7 @@ from jast._src.runtime._jax import is_traced, quick
 from jast._src.runtime.host_errors import runs_on_host
 from jast._src.util import display
 from jast._src.util.checks import check_random_key
-from jast._src.util.pytrees import conform, pad_rows, select, zero_where
+from jast._src.util.pytrees import conform, pad_rows, select, with_rows_of, zero_where
 
 __all__ = ["Episode", "play_back", "play_chosen", "replay", "rollout", "stacked"]
 
@@ -206,12 +206,20 @@ def play_back(
 
 
 def play_chosen(
-    sim: Simulator, reward: Callable, x0: Any, choose: Callable, rows: Any, steps: Any
+    sim: Simulator,
+    reward: Callable,
+    x0: Any,
+    choose: Callable,
+    rows: Any,
+    steps: Any,
+    numbers: jax.Array | None = None,
 ) -> Episode:
     """The episode of at most ``steps`` steps in which ``choose(state, t, rows[t])`` gives the
-    disturbances.
+    disturbances. ``numbers``: those that these depend on, for `with_rows_of`.
     """
     first = begin(sim, reward, x0, last=steps <= 0)
+    if numbers is not None:
+        first = with_rows_of(numbers, first)
     # an ended lane goes on from the start state, so that no NaN reaches a gradient; of a state of
     # zeros no black box is asked
     rest = jax.tree.map(jnp.zeros_like, first.state) if runs_on_host(sim) else first.state

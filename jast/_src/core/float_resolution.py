@@ -23,7 +23,7 @@ from jast._src.core.simulator import Simulator
 from jast._src.core.typing import Array
 from jast._src.runtime._jax import quick
 from jast._src.runtime.host_errors import runs_on_host
-from jast._src.util.pytrees import select, with_strong_types
+from jast._src.util.pytrees import select, with_rows_of, with_strong_types
 
 __all__ = ["Probe", "describe", "probe", "rounding_problem"]
 
@@ -226,6 +226,7 @@ def _five_paths(sim: Simulator, steps: int, keys: jax.Array) -> tuple[Any, ...]:
         differ=no,
         course=_Course(start, farthest=nowhere, change=nowhere, ended=no, back=jnp.int32(0)),
     )
+    first = with_rows_of(keys, first)
     last = lax.while_loop(lambda p: (p.t < steps) & ~jnp.any(p.done[:3]), body, first)
     distance = jax.vmap(evaluate)(last.states)[1] if sim.episodic else last.distance
     leaves = jax.tree.leaves(with_strong_types(state))

@@ -32,7 +32,7 @@ from jast._src.runtime.progress_bar import Watch
 from jast._src.util import display
 from jast._src.util.checks import check_random_key, whole_number
 from jast._src.util.intervals import clopper_pearson
-from jast._src.util.pytrees import zero_where
+from jast._src.util.pytrees import with_rows_of, zero_where
 
 __all__ = ["BRIEF", "Nominal", "nominal", "outcome"]
 
@@ -311,5 +311,6 @@ def outcome(key: Any, sim: Any, live: Any, reward: Callable) -> tuple[Progress, 
     live = jnp.asarray(live)
     # of a state of zeros no black box is asked, whatever the lanes beside it go on with
     first = first._replace(done=first.done | ~live, state=zero_where(~live, first.state))
-    last, steps = lax.while_loop(lambda c: ~c[0].done, step, (first, jnp.zeros((), jnp.int32)))
+    start = with_rows_of(live, (first, jnp.zeros((), jnp.int32)))
+    last, steps = lax.while_loop(lambda c: ~c[0].done, step, start)
     return conclude(sim, reward, last, live), steps

@@ -2,9 +2,7 @@
 number.
 """
 
-from collections.abc import Callable
 from functools import partial
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -13,12 +11,18 @@ from jax import lax
 
 from jast._src.core.simulator import Simulator
 from jast._src.normal_space import transform
-from jast._src.runtime._jax import jit
+from jast._src.runtime._jax import is_brief, jit
 from jast._src.runtime.checkpoints import answer_once
 from jast._src.runtime.device import BLOCK, block_size, on_cpu
 from jast._src.runtime.host_errors import runs_on_host
 
-__all__ = ["PointEvaluator", "evaluate_on_device", "evaluate_points", "lanes_of"]
+__all__ = [
+    "PointEvaluator",
+    "evaluate_distances",
+    "evaluate_on_device",
+    "evaluate_points",
+    "lanes_of",
+]
 
 LANES = 4096  # points of a call at most
 ACCELERATED_LANES = 2**16  # on an accelerator: an H100 then draws plainly ten times as fast
@@ -57,12 +61,42 @@ class PointEvaluator:
         return jax.tree.map(lambda a, b: np.concatenate([a, b[room:]]), found, none)
 
 
-def evaluate_points(sim: Simulator, z: np.ndarray, play: Callable = transform.outcome) -> Any:
-    """`Outcomes` of the points ``z`` [n, D], on the host, or what ``play(sim, z)`` says of each.
-    One program serves every ``n``; a black box runs once a point, in batches of ``n``.
+def evaluate_points(sim: Simulator, z: np.ndarray) -> transform.Outcomes:
+    """`Outcomes` of the points ``z`` [n, D], on the host. One program serves every ``n``; a black
+    box runs once a point, in batches of ``n``.
     """
     if runs_on_host(sim):
-        return answer_once(lambda z: _together(play, sim, jnp.asarray(z)), z)
+        return answer_once(lambda z: _together(sim, jnp.asarray(z)), z)
+    return _outcomes(_by_program(_program(), sim, z))
+
+
+def evaluate_distances(sim: Simulator, z: np.ndarray) -> tuple[transform.Outcomes, np.ndarray]:
+    """`transform.outcome_and_distances` of the points ``z`` [n, D], likewise."""
+    if runs_on_host(sim):
+        return answer_once(lambda z: _together(sim, jnp.asarray(z), True), z)
+    return _by_program(transform.outcome_and_distances, sim, z)
+
+
+def evaluate_on_device(sim: Simulator, z: jax.Array, n: int) -> transform.Outcomes:
+    """`Outcomes` [n] of the first ``n`` of the points ``z`` [`lanes_of`, D] that are on the device,
+    by the program of `evaluate_points`.
+    """
+    play = _program()
+    return _outcomes(answer_once(lambda z: _in_blocks(play, sim, z, np.int32(n)), z, rows=n))
+
+
+def _program():
+    """What is asked of each point: calls of few evaluations ask for distances, too, so that they
+    need no other program for these.
+    """
+    return transform.outcome_and_distances if is_brief() else transform.outcome
+
+
+def _outcomes(found):
+    return found if isinstance(found, transform.Outcomes) else found[0]
+
+
+def _by_program(play, sim, z):
     n, d = z.shape
     lanes, out = lanes_of(d), []
     if n <= LANES:
@@ -73,16 +107,10 @@ def evaluate_points(sim: Simulator, z: np.ndarray, play: Callable = transform.ou
     return out[0] if len(out) == 1 else jax.tree.map(lambda *a: np.concatenate(a), *out)
 
 
-@partial(jit, static_argnums=0)
-def _together(play, sim, z):
+@partial(jit, static_argnums=2)
+def _together(sim, z, distances=False):
+    play = transform.outcome_and_distances if distances else transform.outcome
     return jax.vmap(partial(play, sim))(z)
-
-
-def evaluate_on_device(sim: Simulator, z: jax.Array, n: int) -> transform.Outcomes:
-    """`Outcomes` [n] of the first ``n`` of the points ``z`` [`lanes_of`, D] that are on the device,
-    by the program of `evaluate_points`.
-    """
-    return answer_once(lambda z: _in_blocks(transform.outcome, sim, z, np.int32(n)), z, rows=n)
 
 
 def _padded(play, sim, lanes, z):
@@ -103,13 +131,14 @@ def _in_blocks(play, sim, z, n):
     """What ``play`` says of the first ``n`` of ``z``; of the others what is left of their
     blocks.
     """
-    run, size = jax.vmap(partial(play, sim)), block_size(len(z))
-    like = jax.eval_shape(run, z)
+    size = block_size(len(z))
+    run = jax.jit(jax.vmap(partial(play, sim)))  # traced once for its shapes and for the loop
+    like = jax.eval_shape(run, jax.ShapeDtypeStruct((size, *z.shape[1:]), z.dtype))
 
     def block(i, out):
         new = run(lax.dynamic_slice_in_dim(z, i * size, size))
         place = partial(lax.dynamic_update_slice_in_dim, start_index=i * size, axis=0)
         return jax.tree.map(place, out, new)
 
-    nothing = jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), like)
+    nothing = jax.tree.map(lambda s: jnp.zeros((len(z), *s.shape[1:]), s.dtype), like)
     return lax.fori_loop(0, (n + size - 1) // size, block, nothing)

@@ -9,12 +9,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jast import distributions as D
-from jast._src.core.episode import play_chosen
 from jast._src.core.rewards import likelihood
 from jast._src.core.simulator import Simulator
 from jast._src.core.typing import Array
-from jast._src.normal_space.transform import normal_numbers, policy_of
+from jast._src.normal_space.transform import normal_numbers, play
 from jast._src.runtime._jax import quick
 from jast._src.runtime.checkpoints import step_once
 from jast._src.util.pytrees import map_in_lanes
@@ -56,18 +54,12 @@ def gradients(sim: Simulator, z: np.ndarray) -> Gradients:
 
 @quick
 def _gradients(sim, z):
-    def play(z):
-        policy = policy_of(sim, z)
-
-        def choose(state, t, _):
-            return D.mode(policy.disturbance(state, t))
-
-        # of constant length, so that it can be differentiated backwards
-        e = play_chosen(sim, likelihood(sim), D.mode(policy.start()), choose, (), sim.horizon)
+    def numbers(z):
+        e = play(sim, likelihood(sim), z)
         return jnp.stack([e.distance.astype(z.dtype), -e.reward.astype(z.dtype)]), e
 
     def both(z):
-        _, back, e = jax.vjp(play, z, has_aux=True)
+        _, back, e = jax.vjp(numbers, z, has_aux=True)
         slope, rise = jax.vmap(lambda row: back(row)[0])(jnp.eye(2, dtype=z.dtype))
         return Gradients(e.distance, e.failure, e.length, slope, rise)
 

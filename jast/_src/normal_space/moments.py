@@ -8,16 +8,13 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
-from jast._src.core.signature import signature_of
 from jast._src.core.simulator import Simulator
-from jast._src.normal_space.evaluate_points import evaluate_points
+from jast._src.normal_space.evaluate_points import evaluate_distances
 from jast._src.normal_space.gradients import COST
 from jast._src.normal_space.gradients import gradients as compute_gradients
-from jast._src.normal_space.transform import Outcomes, outcomes_of, simulate
+from jast._src.normal_space.transform import Outcomes
 
 __all__ = ["Linearised", "cost_of_slopes", "distances", "slopes"]
 
@@ -40,23 +37,8 @@ def distances(sim: Simulator, z: np.ndarray) -> tuple[Outcomes, np.ndarray]:
     """`Outcomes` of the points ``z`` [n, D], and the miss distance at each moment [n, M]: at s_0 ..
     s_T, or at the end of a system that is judged there. NaN where an episode had failed, or ended.
     """
-    o, g = evaluate_points(sim, z, _play)
+    o, g = evaluate_distances(sim, z)
     return o, np.where(np.isfinite(g), g, np.nan).astype(np.float64)
-
-
-def _play(sim: Simulator, z: jax.Array) -> tuple[Outcomes, jax.Array]:
-    """`distances` of the one episode of ``z`` [D]."""
-
-    def see(progress, t, g):
-        return g.at[t].set(jnp.where(progress.failure, jnp.nan, sim.evaluate(progress.state)[1]))
-
-    if sim.episodic:
-        end, length, _ = simulate(sim, z)
-        g = jnp.where(end.failure, jnp.nan, end.distance)[None]
-    else:
-        nothing = jnp.full(sim.horizon + 1, jnp.nan, signature_of(sim).dtype)
-        end, length, g = simulate(sim, z, nothing, see)
-    return outcomes_of(sim, end, length), g
 
 
 def cost_of_slopes(sim: Simulator, d: int, gradients: bool) -> int:

@@ -21,7 +21,7 @@ from jax import lax
 from jast import distributions as D
 from jast._src.core import actions, rewards
 from jast._src.core.check import contract
-from jast._src.core.episode import Episode, play_back, rollout
+from jast._src.core.episode import Episode, play_back, play_chosen
 from jast._src.core.policy import Policy
 from jast._src.core.rewards import likelihood
 from jast._src.core.signature import signature_of
@@ -33,7 +33,7 @@ from jast._src.normal_space.sequences import latent_policy
 from jast._src.runtime._jax import jit, quick
 from jast._src.runtime.host_errors import runs_on_host
 from jast._src.util.blocked_matmul import product, rows_of
-from jast._src.util.pytrees import count_numbers, map_in_lanes
+from jast._src.util.pytrees import count_numbers, map_in_lanes, with_rows_of
 
 __all__ = [
     "Latent",
@@ -49,10 +49,12 @@ __all__ = [
     "normal_numbers",
     "normal_of",
     "outcome",
+    "outcome_and_distances",
     "outcome_by_level",
     "outcomes",
     "outcomes_of",
     "place",
+    "play",
     "played",
     "policy_of",
     "side_by_side",
@@ -172,7 +174,7 @@ def simulate(
         return new, t + 1, look(new, t + 1, seen)
 
     begun, none = begin(sim, reward, D.mode(policy.start())), jnp.zeros((), jnp.int32)
-    start = begun, none, look(begun, none, seen)
+    start = with_rows_of(z, (begun, none, look(begun, none, seen)))
     end, length, seen = lax.while_loop(lambda c: ~c[0].done, body, start)
     return conclude(sim, reward, end), length, seen
 
@@ -218,12 +220,41 @@ def outcomes(sim, z):
     return jax.vmap(partial(outcome, sim))(z)
 
 
+def outcome_and_distances(sim: Simulator, z: jax.Array) -> tuple[Outcomes, jax.Array]:
+    """The same, and the miss distance at each moment [M]: at s_0 .. s_T, or at the end of a system
+    that is judged there. NaN where an episode had failed, or ended.
+    """
+
+    def see(progress, t, g):
+        return g.at[t].set(jnp.where(progress.failure, jnp.nan, sim.evaluate(progress.state)[1]))
+
+    if sim.episodic:
+        end, length, _ = simulate(sim, z)
+        g = jnp.where(end.failure, jnp.nan, end.distance)[None]
+    else:
+        nothing = jnp.full(sim.horizon + 1, jnp.nan, signature_of(sim).dtype)
+        end, length, g = simulate(sim, z, nothing, see)
+    return outcomes_of(sim, end, length), g
+
+
+def play(sim: Simulator, reward: Callable, z: jax.Array) -> Episode:
+    """The `jast.Episode` of ``z`` [D]; of a constant number of steps, so that it can be
+    differentiated backwards.
+    """
+    policy = policy_of(sim, z)
+
+    def choose(state, t, _):
+        return D.mode(policy.disturbance(state, t))
+
+    return play_chosen(sim, reward, D.mode(policy.start()), choose, (), sim.horizon, z)
+
+
 @quick
 def episodes(sim, z):
     """The `jast.Episode` of each of ``z`` [n, D], without states."""
 
     def one(z):
-        return rollout(jax.random.key(0), sim, policy_of(sim, z))._replace(states=None)
+        return play(sim, rewards.STANDARD, z)._replace(states=None)
 
     return jax.vmap(one)(z)
 

@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import contextlib
 import threading
-from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import jax
@@ -129,10 +128,17 @@ class Asking:
         return self.function(self.host, *args)
 
 
-def hosts_of(sim) -> Iterator[Any]:
+def hosts_of(sim) -> tuple[Any, ...]:
     """The hosts that the functions of a simulator ask, each once; also those that a function asks
-    which is bound by another one's arguments.
+    which is bound by another one's arguments. The object keeps them.
     """
+    kept = getattr(sim, "__dict__", {})
+    if "_hosts" not in kept:
+        kept["_hosts"] = tuple(_hosts_of(sim))
+    return kept["_hosts"]
+
+
+def _hosts_of(sim):
     seen, left = set(), [sim]
     while left:
         for part in jax.tree.leaves(left.pop(), is_leaf=lambda p: isinstance(p, Partial)):
@@ -145,7 +151,7 @@ def hosts_of(sim) -> Iterator[Any]:
 
 def runs_on_host(sim):
     """Whether the simulator runs on the host: a black box, slow and without gradients."""
-    return any(True for _ in hosts_of(sim))
+    return bool(hosts_of(sim))
 
 
 def runs_made(sim):

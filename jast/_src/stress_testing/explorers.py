@@ -11,8 +11,10 @@ import numpy as np
 
 from jast._src.core.actions import wide
 from jast._src.core.counter_prng import numpy_generator
-from jast._src.core.episode import Episode
+from jast._src.core.episode import Episode, replay, rollout
 from jast._src.core.failures import empty
+from jast._src.core.nominal import Nominal
+from jast._src.core.policy import undisturbed
 from jast._src.core.rewards import likelihood
 from jast._src.core.signature import signature_of
 from jast._src.core.simulator import Simulator
@@ -27,6 +29,8 @@ from jast._src.search.falsify import falsify
 from jast._src.search.forest import forest
 from jast._src.search.go_explore.go_explore import go_explore
 from jast._src.search.monte_carlo import monte_carlo
+from jast._src.util.display import call_settings
+from jast._src.util.intervals import clopper_pearson
 
 __all__ = [
     "EXPLORERS",
@@ -36,6 +40,7 @@ __all__ = [
     "failing_episodes",
     "failures_at",
     "has_quantiles",
+    "nominal_points",
     "slow_cross_entropy",
 ]
 
@@ -85,18 +90,51 @@ def plain_draws(key: jax.Array, sim: Simulator, budget: int) -> ExplorerResult:
     if not has_quantiles(sim):
         reward = likelihood(sim)
         return _from_search(monte_carlo(key, sim, episodes=budget, reward=reward, top=MAX_FAILURES))
+    return _draw_points(key, sim, budget)[0]
+
+
+def nominal_points(key: jax.Array, sim: Simulator, episodes: int) -> tuple[Nominal, Episode]:
+    """`jast.nominal` by points, and failing episodes of it [m]; the undisturbed one has the reward
+    of `collect` here, too, and is a point where all modes are medians: no program is for it alone.
+    """
+    signature, reward, quiet = signature_of(sim), likelihood(sim), None
+    offers = [signature.disturbance, *([signature.start] if signature.random_start else [])]
+    if all(o.mode_is_median for o in offers):
+        e = transform.played(sim, np.zeros((1, transform.dimension(sim))))
+        quiet = replay(sim, jax.tree.map(lambda a: a[0], e), reward=reward)
+    elif all(o.mode for o in offers):
+        quiet = rollout(key, sim, undisturbed(sim), reward)  # draws nothing
+    found, distance = _draw_points(key, sim, episodes)
+    valid = episodes - found.invalid
+    n = Nominal(
+        undisturbed=quiet,
+        failing=found.failing,
+        episodes=episodes,
+        rate=found.failing / episodes,
+        interval=clopper_pearson(found.failing, episodes),
+        mean_distance=distance / valid if valid else np.nan,
+        invalid=found.invalid,
+        settings=call_settings("nominal", key, episodes=episodes),
+    )
+    return n, found.episodes
+
+
+def _draw_points(key, sim, n):
+    """The `ExplorerResult` of ``n`` draws of the model, and the sum of the valid distances."""
     rng, d = numpy_generator(key), transform.dimension(sim)
     failures = np.zeros((0, d), transform.normal_numbers(sim))
-    log_p, failing, invalid = np.zeros(0), 0, 0
-    for begin in range(0, budget, size := lanes_of(d)):
-        z = rng.standard_normal((min(size, budget - begin), d)).astype(failures.dtype)
+    log_p, failing, invalid, distance = np.zeros(0), 0, 0, 0.0
+    for begin in range(0, n, size := lanes_of(d)):
+        z = rng.standard_normal((min(size, n - begin), d)).astype(failures.dtype)
         o = evaluate_points(sim, z)
         failing, invalid = failing + o.failure.sum(), invalid + o.invalid.sum()
+        distance += float(o.distance[~o.invalid].sum(dtype=np.float64))
         failures = np.concatenate([failures, z[o.failure]])
         log_p = np.concatenate([log_p, o.log_p[o.failure]])
         best = np.argsort(-log_p, kind="stable")[:MAX_FAILURES]
         failures, log_p = failures[best], log_p[best]
-    return ExplorerResult(failures_at(sim, failures).episodes, budget, int(failing), int(invalid))
+    episodes = failures_at(sim, failures).episodes
+    return ExplorerResult(episodes, n, int(failing), int(invalid)), distance
 
 
 def falsified(key: jax.Array, sim: Simulator, budget: int) -> ExplorerResult:

@@ -53,6 +53,7 @@ from jast._src.stress_testing.explorers import (
     failing_episodes,
     failures_at,
     has_quantiles,
+    nominal_points,
     slow_cross_entropy,
 )
 from jast._src.stress_testing.mode_shares import mode_shares, shares_cost
@@ -339,12 +340,21 @@ class _StressTest:
         key, episodes = self.next_key(), BRIEF if self.cheap else self.parts.nominal
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)  # the report says it
-            self.nominal = n = nominal(key, self.sim, episodes)
-        found = [] if n.undisturbed is None or not bool(n.undisturbed.failure) else [n.undisturbed]
-        if n.first is not None:
-            found.append(rollout(jax.random.fold_in(key, n.first), self.sim))
-        for e in found:
-            self.pool = merge(self.pool, self.collect([e]), top=2)
+            if self.has_points and not self.hosted and not self.cheap:
+                self.nominal, found = nominal_points(key, self.sim, episodes)
+            else:
+                self.nominal = nominal(key, self.sim, episodes)
+                first = self.nominal.first
+                played = (
+                    [] if first is None else [rollout(jax.random.fold_in(key, first), self.sim)]
+                )
+                found = stacked(played) if played else empty(self.sim).episodes
+        n = self.nominal
+        if n.undisturbed is not None and bool(n.undisturbed.failure):
+            self.pool = self.collect([n.undisturbed])
+        self.pool = merge(
+            self.pool, collect(self.sim, self.reward, found), top=FOUND_FACTOR * self.top
+        )
         self.note("nominal", n.episodes, n.failing, _best_log_density(self.pool), n.invalid)
 
     def collect(self, episodes):
@@ -546,10 +556,10 @@ class _StressTest:
         runs = failing_runs(self.sim)
         if runs:
             found = collect(self.sim, self.reward, failing_episodes(self.sim, runs), top=self.top)
-            if _best_log_density(found) > _best_log_density(self.failures):
+            best = _best_log_density(found)
+            if best > _best_log_density(self.failures):
                 self.residual = self.late = np.nan  # those of another failure
             self.failures = merge(self.failures, found, top=self.top)
-            best = _best_log_density(found)
             if self.modes:
                 self.modes = _with_likelier(self.sim, self.modes, found)
             self.note("failing runs kept", 0, best=best)

@@ -14,7 +14,6 @@ from jax.tree_util import Partial
 __all__ = [
     "Key",
     "as_partial",
-    "zero_where",
     "count_numbers",
     "conform",
     "fields_of",
@@ -24,6 +23,8 @@ __all__ = [
     "shapes_text",
     "with_strong_types",
     "traceable",
+    "with_rows_of",
+    "zero_where",
 ]
 
 
@@ -86,6 +87,22 @@ class _WithFunctions:
 def select(pred: Any, a: Any, b: Any) -> Any:
     """``a`` where the scalar ``pred`` holds, else ``b``."""
     return jax.tree.map(lambda x, y: jnp.where(pred, x, y), a, b)
+
+
+def with_rows_of(like: jax.Array, tree: Any) -> Any:
+    """``tree``, the carry that a loop starts with, of which every array depends on the numbers
+    ``like``, for `jax.vmap` and for derivatives; the values are the same.
+
+    JAX batches and differentiates the body of a loop again and again until it knows which arrays of
+    the carry depend on what it maps over: here all do, as soon as episodes end one by one.
+    """
+    first = jnp.ravel(like)[0]  # never greater than itself
+
+    def tie(a: jax.Array) -> jax.Array:
+        moves = all(jnp.issubdtype(b.dtype, jnp.floating) for b in (a, first))
+        return jnp.where(first > first, a + first.astype(a.dtype) if moves else a, a)
+
+    return jax.tree.map(tie, tree)
 
 
 def zero_where(pred: Any, tree: Any) -> Any:
