@@ -37,8 +37,7 @@ __all__ = [
 
 LENGTHSCALES = tuple(10 ** (-1.7 + 2.1 * i / 11) for i in range(12))
 """The grid, as multiples of a scale: 0.02 to 2.5; a convention."""
-NOISES = (1e-4, 1e-2)
-"""The grid of the noise's variance, as shares of the signal's; a convention."""
+NOISES = (1e-4, 1e-2)  # the grid of the noise's variance, as shares of the signal's; a convention
 JITTER = 1e-6  # added to every noise, so that float32 factors stay positive definite
 
 

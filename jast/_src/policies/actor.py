@@ -84,8 +84,7 @@ class Normalisation(NamedTuple):
     """
 
 
-Networks = tuple[Callable, Callable]
-"""``apply`` of the actor and of the critic."""
+Networks = tuple[Callable, Callable]  # ``apply`` of the actor and of the critic
 
 
 def make_networks(n: int, hidden: tuple[int, ...], components: int) -> tuple[Networks, Networks]:

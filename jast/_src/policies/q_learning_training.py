@@ -33,8 +33,7 @@ __all__ = [
     "user_cell",
 ]
 
-CellOf = Callable[..., jax.Array]
-"""``cell(table, observation [m], t)``: the number of the cell of a state."""
+CellOf = Callable[..., jax.Array]  # ``cell(table, observation [m], t)``: the number of a cell
 
 
 class Table(NamedTuple):

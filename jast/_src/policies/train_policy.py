@@ -34,8 +34,7 @@ ENOUGH_FAILURES = 0.2  # failing share from which lambda is no longer raised
 FIRST_RAISE = 0.2  # part of the learning after which lambda may be raised: the policy follows it
 LAST_RAISE = 0.75  # and up to which: what follows has time to learn
 ROUNDING = 3e-3  # relative deviation of the miss distance that may be rounding of float32 sums
-COUNTS = ("episodes", "steps", "invalid")
-"""Fields of a history that are whole numbers, and go on from row to row."""
+COUNTS = ("episodes", "steps", "invalid")  # of a history: whole numbers that go on from row to row
 
 
 class Method(NamedTuple):

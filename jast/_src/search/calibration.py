@@ -29,16 +29,12 @@ from jast._src.util.pytrees import select
 
 __all__ = ["Calibration", "calibrate", "with_calibration"]
 
-EPISODES = 128
-"""Episodes of a batch."""
-HOSTED_EPISODES = 10
-"""Episodes of a batch of a system on the host, where they are dear."""
-WIDTHS = 1.0, 1.5, 2.0, 3.0, 4.0, 6.0
-"""Widths of the noise that are tried, in this order."""
+EPISODES = 128  # episodes of a batch
+HOSTED_EPISODES = 10  # episodes of a batch of a system on the host, where they are dear
+WIDTHS = 1.0, 1.5, 2.0, 3.0, 4.0, 6.0  # widths of the noise that are tried, in this order
 FAILING_SHARE = 0.01
 """Share of failing episodes from which no wider noise is tried: that found less likely failures."""
-NEAR_SHARE = 0.1
-"""Share of the episodes: where none fails, that width is taken of which these come nearest."""
+NEAR_SHARE = 0.1  # where no episode fails, that width is taken of which so many come nearest
 
 
 class Calibration(NamedTuple):

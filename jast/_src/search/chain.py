@@ -32,20 +32,13 @@ from jast._src.util.display import call_settings
 
 __all__ = ["chain"]
 
-LANES = 64
-"""Chains of all widths: few, as what they need is many moves."""
-MOMENTS = 100
-"""Of the history, about."""
-FAILING_SHARE = 0.1
-"""The widest noise is the first of `WIDTHS` of which so many draws fail."""
-WIDEST_WITHOUT = 3.0
-"""The widest noise where nothing fails."""
-MIN_LEVELS = 4
-"""Widths of the chains, at least."""
-MAX_LEVELS = 16
-"""Widths of the chains, at most."""
-FIRST_SCALE = 0.5
-"""Of the moves, before it adapts."""
+LANES = 64  # chains of all widths: few, as what they need is many moves
+MOMENTS = 100  # of the history, about
+FAILING_SHARE = 0.1  # the widest noise is the first of `WIDTHS` of which so many draws fail
+WIDEST_WITHOUT = 3.0  # the widest noise where nothing fails
+MIN_LEVELS = 4  # widths of the chains, at least
+MAX_LEVELS = 16  # widths of the chains, at most
+FIRST_SCALE = 0.5  # of the moves, before it adapts
 
 
 class State(NamedTuple):

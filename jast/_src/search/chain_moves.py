@@ -21,18 +21,12 @@ __all__ = ["Chains", "Points", "draw_wider", "move_chains", "no_points"]
 ACCEPTANCE = 0.3
 """Share of the moves taken that the scale of the moves is adapted to: near what is optimal for
 random walks (Roberts, Gelman and Gilks 1997)."""
-ADAPTATION = 0.3
-"""How fast: change of the logarithm of the scale per share too much."""
-MIN_SCALE = 0.005
-"""Of the moves."""
-MEMORY = 0.95
-"""Of the share of the moves taken, kept from one move to the next."""
-SWAP_MEMORY = 0.9
-"""Of the share of the exchanges, kept from one to the next."""
-MOVES = np.uint32(1)
-"""Address of the random numbers of moves."""
-SWAPS = np.uint32(2)
-"""Address of those of exchanges."""
+ADAPTATION = 0.3  # how fast: change of the logarithm of the scale per share too much
+MIN_SCALE = 0.005  # of the moves
+MEMORY = 0.95  # of the share of the moves taken, kept from one move to the next
+SWAP_MEMORY = 0.9  # of the share of the exchanges, kept from one to the next
+MOVES = np.uint32(1)  # address of the random numbers of moves
+SWAPS = np.uint32(2)  # address of those of exchanges
 
 
 class Points(NamedTuple):

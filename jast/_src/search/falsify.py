@@ -31,32 +31,19 @@ from jast._src.util.pytrees import count_numbers, map_in_lanes
 
 __all__ = ["falsify"]
 
-LANES = 64
-"""Failures whose normal numbers one program, of one shape, makes."""
-TAIL = 3e-5
-"""Probability beyond what is taken for an end of a disturbance's range: 4 standard deviations."""
-BATCH = 10
-"""Simulations side by side."""
-FIRST_SIGNALS = 30
-"""Signals of few pieces that are drawn before any is changed."""
-POOL = 10
-"""Nearest signals that are kept to be changed."""
-PIECES = 1, 2, 3, 5, 10
-"""Numbers of pieces of the first signals, beside one piece a step."""
-CROSSOVER = 0.3
-"""Share of the children that have two parents."""
-STEP = 0.25
-"""Standard deviation of a move of u."""
-MORE_CHANGES = 0.7
-"""Mean number of the changes of a child beyond the first."""
-ONE_COLUMN = 0.6
-"""Share of the changes that are of one number of the disturbance; the others are of all."""
-MOVED_AS_ONE = 0.35
-"""Share of the changes that move a stretch by one amount, which keeps its shape."""
-MOVED_APART = 0.25
-"""Share of those that move each of its steps by itself."""
-HELD_ANYWHERE = 0.2
-"""Share of those that hold it at a level drawn anew; the others hold it at an end of the range."""
+LANES = 64  # failures whose normal numbers one program, of one shape, makes
+TAIL = 3e-5  # probability beyond what is taken for an end of a range: 4 standard deviations
+BATCH = 10  # simulations side by side
+FIRST_SIGNALS = 30  # signals of few pieces that are drawn before any is changed
+POOL = 10  # nearest signals that are kept to be changed
+PIECES = 1, 2, 3, 5, 10  # numbers of pieces of the first signals, beside one piece a step
+CROSSOVER = 0.3  # share of the children that have two parents
+STEP = 0.25  # standard deviation of a move of u
+MORE_CHANGES = 0.7  # mean number of the changes of a child beyond the first
+ONE_COLUMN = 0.6  # share of the changes of one number of the disturbance; the others are of all
+MOVED_AS_ONE = 0.35  # share of the changes that move a stretch by one amount, which keeps its shape
+MOVED_APART = 0.25  # share of those that move each of its steps by itself
+HELD_ANYWHERE = 0.2  # share of those that hold it at a level drawn anew; the others, at an end
 
 
 class Pool(NamedTuple):

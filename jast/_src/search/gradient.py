@@ -27,10 +27,8 @@ from jast._src.util.display import call_settings
 
 __all__ = ["gradient"]
 
-SHARE = 2.0
-"""Of the evaluations, for the refinement: descents are few, and end anywhere on the boundary."""
-EVALUATIONS = STEPS * GRADIENT + EPISODES
-"""Of one descent."""
+SHARE = 2.0  # of the evaluations, for the refinement: descents end anywhere on the boundary
+EVALUATIONS = STEPS * GRADIENT + EPISODES  # of one descent
 
 
 def gradient(

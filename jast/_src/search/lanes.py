@@ -38,8 +38,7 @@ __all__ = [
 
 
 NEVER = np.int32(2**31 - 1)  # the greatest int32: no simulation has this number
-EMPTY_HASH = np.uint32(0x9E3779B9)
-"""The hash of no disturbance."""
+EMPTY_HASH = np.uint32(0x9E3779B9)  # the hash of no disturbance
 
 
 class Played(NamedTuple):

@@ -34,12 +34,9 @@ from jast._src.util.pytrees import map_in_lanes, select
 
 __all__ = ["monte_carlo"]
 
-LANES = 4096
-"""Episodes that step together."""
-HOSTED_LANES = 64
-"""Those of a system on the host: a search is watched and interrupted between two such chunks."""
-MOMENTS = 200
-"""Of the history, about: a moment is at least a block of ``LANES`` episodes."""
+LANES = 4096  # episodes that step together
+HOSTED_LANES = 64  # those of a system on the host, watched and interrupted between two chunks
+MOMENTS = 200  # of the history, about: a moment is at least a block of ``LANES`` episodes
 
 
 class Top(NamedTuple):

@@ -44,34 +44,22 @@ __all__ = [
     "slow_cross_entropy",
 ]
 
-MAX_FAILURES = 128
-"""Failures that an explorer hands over, the most."""
+MAX_FAILURES = 128  # failures that an explorer hands over, the most
 PRUNES = 18
 """Prunes of a tree: 10 with more simulations each found failures of `jast.simulators.colav` in half
 as many trees.
 """
-TREE_EVALUATIONS = 2500
-"""Evaluations for each tree of a forest, and at most as many trees as below."""
-MAX_TREES = 64
-"""Trees of a forest; one with more would prune too rarely."""
-COOLED_EVALUATIONS = 84
-"""Evaluations for each failure that is cooled: its wide draws, and a move at each width."""
-LEVEL_EVALUATIONS = 12
-"""Evaluations for each point that goes down the levels of the distance."""
-LEVEL_POINTS = 50, 1000
-"""Least and greatest number of them."""
-DESCENT_EVALUATIONS = 108
-"""Evaluations for each descent by gradients."""
-DESCENTS = 4, 48
-"""Least and greatest number of them."""
-ITERATIONS = 15
-"""Iterations of the cross-entropy method."""
-SLOW_ITERATIONS = 30
-"""Iterations of `slow_cross_entropy`: half of them with twice the draws ends in worse basins."""
-SLOW_WIDTH = 0.5
-"""Width of its first draws around a failure."""
-ELITES = 10
-"""Share of the draws that the cross-entropy method fits, as its denominator. A convention."""
+TREE_EVALUATIONS = 2500  # evaluations for each tree of a forest, and at most as many trees as below
+MAX_TREES = 64  # trees of a forest; one with more would prune too rarely
+COOLED_EVALUATIONS = 84  # of each failure that is cooled: its wide draws, and a move at each width
+LEVEL_EVALUATIONS = 12  # evaluations for each point that goes down the levels of the distance
+LEVEL_POINTS = 50, 1000  # least and greatest number of them
+DESCENT_EVALUATIONS = 108  # evaluations for each descent by gradients
+DESCENTS = 4, 48  # least and greatest number of them
+ITERATIONS = 15  # iterations of the cross-entropy method
+SLOW_ITERATIONS = 30  # half as many with twice the draws end in worse basins
+SLOW_WIDTH = 0.5  # width of its first draws around a failure
+ELITES = 10  # share of the draws that the cross-entropy method fits, its denominator; a convention
 
 
 class ExplorerResult(NamedTuple):

@@ -20,20 +20,13 @@ from jast._src.util.intervals import effective_interval
 
 __all__ = ["corrected_shares", "mode_shares", "shares_cost"]
 
-MIN_BUDGET = 10_000
-"""Evaluations of the whole budget below which nothing is told: draws would be too great a part."""
-LARGE_BUDGET = 100_000
-"""Evaluations of the whole budget from which on there are more draws."""
-SMALL_DRAWS = 1024
-"""Draws of the proposal below a large budget: a tenth of it at most."""
-LARGE_DRAWS = 4096
-"""Draws of the proposal with a large budget: shares are then known to a few per cent."""
-DRAWS_PER_FAILURE = 4
-"""Of this many draws one failure is chosen, by weight."""
-MAX_PATH_FAILURES = 128
-"""Failures that are told apart by paths, too."""
-PATHS_SHARE = 0.05
-"""Share of the budget that these paths may cost."""
+MIN_BUDGET = 10_000  # of the whole, below which nothing is told: draws would be too great a part
+LARGE_BUDGET = 100_000  # evaluations of the whole budget from which on there are more draws
+SMALL_DRAWS = 1024  # draws of the proposal below a large budget: a tenth of it at most
+LARGE_DRAWS = 4096  # the same with a large budget: shares are then known to a few per cent
+DRAWS_PER_FAILURE = 4  # of this many draws one failure is chosen, by weight
+MAX_PATH_FAILURES = 128  # failures that are told apart by paths, too
+PATHS_SHARE = 0.05  # share of the budget that these paths may cost
 
 
 def shares_cost(budget: int) -> int:

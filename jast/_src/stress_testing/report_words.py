@@ -23,13 +23,10 @@ __all__ = [
 ]
 
 UNRELIABLE_BADGE = "UNRELIABLE: believe plain draws only"
-MAX_RESIDUAL = 0.05
-"""Residual below which a failure is called locally likeliest. A convention."""
+MAX_RESIDUAL = 0.05  # residual below which a failure is called locally likeliest; a convention
 
-SHOWN_INCIDENTS = 3
-"""Kinds of what went wrong in a black box that are shown."""
-DRAWN_MODES = 4
-"""Modes whose failure a picture of the report shows, and a notebook's cell: as many as fit."""
+SHOWN_INCIDENTS = 3  # kinds of what went wrong in a black box that are shown
+DRAWN_MODES = 4  # modes whose failure a picture or a notebook's cell shows: as many as fit
 
 
 class Belief(NamedTuple):

@@ -63,35 +63,25 @@ from jast._src.util.display import call_settings
 
 __all__ = ["DEFAULT_BUDGET", "stress"]
 
-MIN_BUDGET = 300
-"""Evaluations of a call, at least: with fewer no explorer is worth a call."""
-DEFAULT_BUDGET = 200_000
-"""Evaluations by default where populations are not the answer."""
+MIN_BUDGET = 300  # evaluations of a call, at least: with fewer no explorer is worth a call
+DEFAULT_BUDGET = 200_000  # evaluations by default where populations are not the answer
 REDRAWN_EPISODES = 400
 """Draws of the estimate's proposal, where only it found failures, but no more than all batches
 together may have of a small budget."""
 REDRAWN_BATCHES = 20
 """Of so many draws at most, until one fails: of the ferry's proposal with 20,000 evaluations (key
 0) that was one of the seventh batch."""
-MIN_COUNTED_EPISODES = 100
-"""Plain draws for the probability, at least, where nothing else tells it."""
-MODES_SHARE = 0.05
-"""Share of the budget that telling modes apart may cost at most."""
-EVEN_SHARE = 0.5
-"""Share of the search that all explorers divide evenly."""
-FURTHER_CALLS = 6
-"""Calls of explorers that divide the rest."""
-GAIN_DECAY = 0.1
-"""How much of its last gain is expected of an explorer that gained nothing since."""
-MIN_DIVIDED_BUDGET = 2000
-"""Evaluations below which each explorer is called once, and failures are refined once."""
-OPTIMAL_RESIDUAL = 1e-2
-"""A residual at which a failure is locally likeliest."""
+MIN_COUNTED_EPISODES = 100  # plain draws for the probability, at least, where nothing else tells it
+MODES_SHARE = 0.05  # share of the budget that telling modes apart may cost at most
+EVEN_SHARE = 0.5  # share of the search that all explorers divide evenly
+FURTHER_CALLS = 6  # calls of explorers that divide the rest
+GAIN_DECAY = 0.1  # how much of its last gain is expected of an explorer that gained nothing since
+MIN_DIVIDED_BUDGET = 2000  # below it each explorer is called once, and failures are refined once
+OPTIMAL_RESIDUAL = 1e-2  # a residual at which a failure is locally likeliest
 FEW_MODES = 4
 """With so few modes, and a likeliest failure that is locally so, `slow_cross_entropy` would find
 nothing else: its evaluations are the estimate's."""
-COOLING_SHARE = 0.2
-"""Share of the evaluations by which failures of the populations are cooled to the likeliest."""
+COOLING_SHARE = 0.2  # of the evaluations, to cool failures of the populations to the likeliest
 COOLING_BESIDE_ACCELERATOR = 2**20
 """Of them at most where an accelerator simulates: the CPU cools, and takes some five seconds. A
 fifth of what an H100 simulates by default, 33 million, took it thirty."""
@@ -103,22 +93,17 @@ REFINE_EVALUATIONS = 50_000
 """Evaluations for pulling what was cooled to where log p is greatest, at most an eighth of all: on
 the crossing, the cart-pole and the ship failures are as likely with half as many and twice as many
 coolings, which cost a tenth of the CPU time."""
-POOL_FACTOR = 32
-"""Failures in the pool for each that is returned: modes are told apart among these."""
+POOL_FACTOR = 32  # failures in the pool for each that is returned: modes are told apart among these
 HOSTED_EXTRA = 14
 """Runs of a black box that no other piece of the work counts: of `check` 10, the undisturbed
 episode and its proof, and two that are made again to see whether they are answered the same."""
-LAST_SHARE = 0.15
-"""Share of the budget that a black box keeps for the probability, whatever came before."""
+LAST_SHARE = 0.15  # of the budget, what a black box keeps for the probability, whatever came before
 FALSIFY_SHARE = 0.2
 """Share of a black box's search that looks for a first failure, at most, where several explorers
 follow; below `MIN_DIVIDED_BUDGET` all of it may."""
-LEAST_REFINED = 100
-"""Evaluations that `refine` takes at least."""
-REFINED_FACTOR = 8
-"""Failures that refinement starts from for each that is returned."""
-FOUND_FACTOR = 4
-"""Failures of one explorer for each that is returned."""
+LEAST_REFINED = 100  # evaluations that `refine` takes at least
+REFINED_FACTOR = 8  # failures that refinement starts from for each that is returned
+FOUND_FACTOR = 4  # failures of one explorer for each that is returned
 
 
 class BudgetShares(NamedTuple):

@@ -22,12 +22,9 @@ from jast._src.search.lanes import EMPTY_HASH, blank_episodes, fold_hash
 
 __all__ = ["Cells", "choose_cells", "empty_cells", "features", "merge_cells"]
 
-PHASES = 16
-"""Stretches of the horizon that cells tell apart."""
-HALVES = 12
-"""Halvings of the rank of the miss distance: the nearest of 4096 states are told apart."""
-SIDES = 3
-"""Cells to each side of the mean of a projection, half a standard deviation each."""
+PHASES = 16  # stretches of the horizon that cells tell apart
+HALVES = 12  # halvings of the rank of the miss distance: the nearest of 4096 states are told apart
+SIDES = 3  # cells to each side of the mean of a projection, half a standard deviation each
 
 
 class Cells(NamedTuple):

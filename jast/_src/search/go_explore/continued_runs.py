@@ -35,8 +35,7 @@ __all__ = [
     "start_point",
 ]
 
-PERSISTING = np.uint32(1 << 31)
-"""Address of what persists in the noise of a run, apart from those of its steps."""
+PERSISTING = np.uint32(1 << 31)  # address of what persists in the noise of a run
 
 
 class Point(NamedTuple):

@@ -38,18 +38,12 @@ from jast._src.util.display import call_settings
 
 __all__ = ["go_explore"]
 
-LANES = 256
-"""Runs side by side."""
-HOSTED_LANES = 64
-"""Those of a system on the host, which is watched and interrupted between two rounds of them."""
-SLOTS = 4096
-"""States that are kept at most."""
-TRACES = 4
-"""Failures that are made likelier side by side."""
-BACK = 0.6
-"""Share of that work before it is at the start."""
-MOMENTS = 100
-"""Of the history, about."""
+LANES = 256  # runs side by side
+HOSTED_LANES = 64  # those of a system on the host, watched and interrupted between two rounds
+SLOTS = 4096  # states that are kept at most
+TRACES = 4  # failures that are made likelier side by side
+BACK = 0.6  # share of that work before it is at the start
+MOMENTS = 100  # of the history, about
 
 
 class State(NamedTuple):

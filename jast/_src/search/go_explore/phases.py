@@ -27,18 +27,12 @@ from jast._src.util.pytrees import select
 
 __all__ = ["Plan", "Traces", "improve_backward", "explore"]
 
-POINTS = 8
-"""States that are kept of a run at most."""
-FROM_START = 0.1
-"""Share of the runs that are from the start."""
-NEAREST = 0.5
-"""Share of the others that are from the states nearest to failure."""
-WIDTHS = 1.0, 1.0, 1.5, 2.0, 3.0, 4.0
-"""Of the noise, one of which a run draws from: a third draw from the model."""
-PERSISTING = 0.0, 0.0, 0.5, 0.9
-"""Shares of the noise that are the same at every step, one of which a run draws with."""
-COINS = np.uint32(3 << 30)
-"""Address of a run's choices, apart from those of its steps."""
+POINTS = 8  # states that are kept of a run at most
+FROM_START = 0.1  # share of the runs that are from the start
+NEAREST = 0.5  # share of the others that are from the states nearest to failure
+WIDTHS = 1.0, 1.0, 1.5, 2.0, 3.0, 4.0  # of the noise of a run: a third draw from the model
+PERSISTING = 0.0, 0.0, 0.5, 0.9  # shares of the noise of a run that are the same at every step
+COINS = np.uint32(3 << 30)  # address of a run's choices, apart from those of its steps
 
 
 class Plan(NamedTuple):

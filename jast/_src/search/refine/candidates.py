@@ -37,36 +37,22 @@ __all__ = [
     "shift_in_time",
 ]
 
-RAY_LENGTHS = 8, 4, 2, 1, 0.5, 0.25
-"""Lengths of the rays, as shares of the gap."""
-SLOPE_LENGTHS = 2.5, 1, 0.4
-"""Lengths of the steps along the boundary, as shares of ``Point.length``."""
+RAY_LENGTHS = 8, 4, 2, 1, 0.5, 0.25  # lengths of the rays, as shares of the gap
+SLOPE_LENGTHS = 2.5, 1, 0.4  # steps along the boundary, as shares of ``Point.length``
 RAISED = 0, 0.1, 0.3, 0.6
 """How far each of them is lifted for a boundary that bends, as shares of the angle of the step."""
-WIDTHS = 3, 1, 0.3, 0.1, 3, 1, 0.3, 0.1
-"""Widths of the random steps, as shares of ``Point.width``."""
-RAYS = len(RAY_LENGTHS)
-"""Candidates of a point in a round that are rays."""
-SLOPES = len(SLOPE_LENGTHS) * len(RAISED)
-"""Those that are steps along the boundary."""
-WALKS = len(WIDTHS)
-"""Those that are random steps, without the last step that paid."""
-REMOVALS = 6
-"""Those that are removals of numbers."""
-EXCHANGES = 8
-"""Those that exchange numbers."""
-SHIFTS = 4
-"""Those that are shifts in time."""
-SIZE = RAYS + SLOPES + WALKS + 1 + REMOVALS + EXCHANGES + SHIFTS
-"""All candidates of a point in a round."""
-NEAREST = 1e-6
-"""The least gap, and the least of what is divided by."""
-FARTHEST = 0.5
-"""The largest gap."""
-MIN_STEP = 1e-3
-"""The least length and width."""
-ENTRANTS = 4
-"""Numbers among which an exchange takes the dearest, or the cheapest."""
+WIDTHS = 3, 1, 0.3, 0.1, 3, 1, 0.3, 0.1  # widths of the random steps, as shares of ``Point.width``
+RAYS = len(RAY_LENGTHS)  # candidates of a point in a round that are rays
+SLOPES = len(SLOPE_LENGTHS) * len(RAISED)  # those that are steps along the boundary
+WALKS = len(WIDTHS)  # those that are random steps, without the last step that paid
+REMOVALS = 6  # those that are removals of numbers
+EXCHANGES = 8  # those that exchange numbers
+SHIFTS = 4  # those that are shifts in time
+SIZE = RAYS + SLOPES + WALKS + 1 + REMOVALS + EXCHANGES + SHIFTS  # all of a point in a round
+NEAREST = 1e-6  # the least gap, and the least of what is divided by
+FARTHEST = 0.5  # the largest gap
+MIN_STEP = 1e-3  # the least length and width
+ENTRANTS = 4  # numbers among which an exchange takes the dearest, or the cheapest
 
 
 class Point(NamedTuple):

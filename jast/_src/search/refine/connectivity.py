@@ -21,24 +21,18 @@ __all__ = [
     "nearest",
 ]
 
-PLACES = 7
-"""Points of a path between two failures, at first."""
+PLACES = 7  # points of a path between two failures, at first
 LIFTS = 1.0, 1.03, 1.06, 1.1
 """How much farther out than the line between the two a path may run: a tenth of the way from the
 origin, at most."""
-OPPOSITE = -0.5
-"""The cosine of two failures below which no path is looked for."""
-ALIKE = 0.8
-"""The cosine from which two are alike, where nothing can be simulated."""
+OPPOSITE = -0.5  # the cosine of two failures below which no path is looked for
+ALIKE = 0.8  # the cosine from which two are alike, where nothing can be simulated
 FINE = 0.1
 """Angle, in radians, between two places of a path that is believed: between the two sides of
 README's lane there is one with eight gaps of .12, of which one holds no failure."""
-RARER = 1.0
-"""By how many nats one on the way between two modes may be rarer than the rarer of the two."""
-BENT = 0.1
-"""How far beside the line a path may bend, as a share of the way from the origin."""
-MOVES = 2
-"""Moves of the points of a path that is bent."""
+RARER = 1.0  # by how many nats the way between two modes may be rarer than the rarer of them
+BENT = 0.1  # how far beside the line a path may bend, as a share of the way from the origin
+MOVES = 2  # moves of the points of a path that is bent
 TRIALS = 8
 """Candidates of a move, of which the best is taken. Of the failures of the ferry straight paths
 make 10, 13 and 11 modes (three keys, 6,000 evaluations at most) and these one (14,300 at most); of
@@ -46,12 +40,9 @@ the ship's 12 and 7 (within 12,500: 7, 8 with four moves, 9 with one move or six
 the lane and of the arm, four branches and the 14 found of "2 of 10" and of "series 60, turned" stay
 apart.
 """
-PAIRS = 32
-"""Paths looked for at a time, of all modes."""
-MIN_PAIRS = 2
-"""Of each mode, at least."""
-IN_VAIN = 4
-"""Times in a row in which paths by way of others join no two modes, after which it is enough."""
+PAIRS = 32  # paths looked for at a time, of all modes
+MIN_PAIRS = 2  # of each mode, at least
+IN_VAIN = 4  # times in a row that paths by way of others join no two modes, which are enough
 
 
 def components(

@@ -20,16 +20,11 @@ from jast._src.util import checks
 
 __all__ = ["REFINED", "SHARE", "default_share", "refine_failures", "with_refine_share"]
 
-SHARE = 0.1
-"""Evaluations of the refinement by default, as a share of the search's episodes; a convention."""
-MIN_BUDGET = 100
-"""Evaluations below which there is no refinement: `jast.search.refine` takes no fewer."""
-MAX_HOSTED = 16
-"""Failures of a system on the host that are refined: each has to run once more for that."""
-ADDRESS = 0x656E6421
-"""Folded into the search's key, far from the numbers of trees."""
-REFINED = -2
-"""The tree that refined failures are said to be of."""
+SHARE = 0.1  # evaluations of the refinement by default, as a share of the episodes; a convention
+MIN_BUDGET = 100  # evaluations below which there is no refinement: `refine` takes no fewer
+MAX_HOSTED = 16  # failures of a system on the host that are refined: each has to run once more
+ADDRESS = 0x656E6421  # folded into the search's key, far from the numbers of trees
+REFINED = -2  # the tree that refined failures are said to be of
 
 
 def default_share(sim: Simulator, reward: Any) -> float:

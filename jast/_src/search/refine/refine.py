@@ -27,26 +27,17 @@ from jast._src.util.pytrees import count_numbers
 
 __all__ = ["GRADIENT", "Refined", "first_failing_lift", "lift", "refine"]
 
-POINTS = 16
-"""Failures that are pulled side by side."""
-DIFFERENCES = 64
-"""Differences of a point in a round."""
-GRADIENT = 4
-"""Evaluations that a gradient of distance and log p is counted as."""
-LOOK = 5
-"""Rounds between two looks at the points."""
-SAME_PLACE = 0.02
-"""Points nearer to one another than this share of their way from the origin go on as one."""
+POINTS = 16  # failures that are pulled side by side
+DIFFERENCES = 64  # differences of a point in a round
+GRADIENT = 4  # evaluations that a gradient of distance and log p is counted as
+LOOK = 5  # rounds between two looks at the points
+SAME_PLACE = 0.02  # points nearer to one another than this share of their norm go on as one
 SMALL_GAIN = 1e-6
 """Share of its cost, less than which a point gained in `PATIENCE` looks once it has arrived."""
-PATIENCE = 6
-"""Looks without gain before a point has converged."""
-STARTING = 0.5
-"""Share of the budget in which further failures are started with."""
-MIN_ROUNDS = 15
-"""Rounds that a further failure must still get; fewer would not bring it near its end."""
-ALIKE = 0.7
-"""In the rest, of points with at least this cosine only the likeliest goes on."""
+PATIENCE = 6  # looks without gain before a point has converged
+STARTING = 0.5  # share of the budget in which further failures are started with
+MIN_ROUNDS = 15  # rounds that a further failure must still get: fewer do not bring it near its end
+ALIKE = 0.7  # in the rest, of points with at least this cosine only the likeliest goes on
 LIFTS = np.array([0.0, 1e-6, 1e-5, 1e-4, 1e-3, 1e-2])
 """How much farther out a point may be taken that is on the knife edge, where one program says that
 it fails and another one that it does not: the least that makes it fail."""
@@ -172,8 +163,7 @@ def first_failing_lift(failure: np.ndarray, n: int) -> tuple[np.ndarray, np.ndar
     return points, np.argmax(failure[:, points], axis=0) * n + points
 
 
-HOSTED_LIFTS = 2
-"""Lifts of each point that are tried at the end where each is a run of a black box."""
+HOSTED_LIFTS = 2  # lifts of each point that are tried at the end where each is a run of a black box
 
 
 class _Track:

@@ -22,16 +22,11 @@ from jast._src.search.refine.candidates import (
 
 __all__ = ["first_points", "residuals", "round_of"]
 
-FIRST_GAP = 0.3
-"""How far inside the failures a point may be at first, as a share of its way from the origin."""
-FIRST_WIDTH = 0.5
-"""Of the first random steps, likewise."""
-ASIDE = 1e-4
-"""How far aside numbers at 0 are moved for gradients: there may be a kink."""
-OUTSIDE = 0.01
-"""How far outside of the failures gradients are taken at most, as a share of the way there."""
-EDGE = 0.05
-"""How far outside of them differences are taken at least."""
+FIRST_GAP = 0.3  # how far inside the failures a point may be at first, as a share of its norm
+FIRST_WIDTH = 0.5  # of the first random steps, likewise
+ASIDE = 1e-4  # how far aside numbers at 0 are moved for gradients: there may be a kink
+OUTSIDE = 0.01  # how far outside of them gradients are taken at most, as a share of the way there
+EDGE = 0.05  # how far outside of them differences are taken at least
 
 
 def first_points(sim: Simulator, v: np.ndarray) -> tuple[Point, np.ndarray]:

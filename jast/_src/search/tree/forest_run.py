@@ -40,16 +40,11 @@ __all__ = ["grow_trees"]
 MEMOIZE = ("auto", "node", "root", "none")
 PUBLISHED = ("code", "text", "paper", "thesis")
 """Modes that maximise the reward of before by default, over draws of the model."""
-EXECUTOR_LANES = 64
-"""Trees of a group with an executor, at least: fewer side by side cost more each."""
-EXPLORATION = 10.0
-"""The published one."""
-BOUNDED_EXPLORATION = 1.0
-"""For `jast.rewards.lexicographic`, whose range is (-1, 1]."""
-CHUNK = 500
-"""Simulations of a tree between two looks at the keyboard."""
-HOSTED_CHUNK = 10
-"""Those of a system on the host."""
+EXECUTOR_LANES = 64  # trees of a group with an executor, at least: fewer cost more each
+EXPLORATION = 10.0  # the published one
+BOUNDED_EXPLORATION = 1.0  # for `jast.rewards.lexicographic`, whose range is (-1, 1]
+CHUNK = 500  # simulations of a tree between two looks at the keyboard
+HOSTED_CHUNK = 10  # those of a system on the host
 
 
 class Job(NamedTuple):

@@ -17,10 +17,8 @@ from jast._src.util.pytrees import select
 __all__ = ["Guide", "child_value", "guide", "rolled"]
 
 
-_SHARE = np.uint32(1 << 31)
-"""Address apart from those of levels."""
-_HEAD = np.uint32(1)
-"""Address apart from that of what is drawn without heads."""
+_SHARE = np.uint32(1 << 31)  # address apart from those of levels
+_HEAD = np.uint32(1)  # address apart from that of what is drawn without heads
 
 
 @jax.tree_util.register_dataclass

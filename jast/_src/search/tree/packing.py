@@ -13,8 +13,7 @@ from jax import lax
 
 __all__ = ["pack", "unpack", "width"]
 
-SMALL = {1: jnp.uint8, 2: jnp.uint16}
-"""Bytes of a dtype that is less than a word -> the numbers that have its bits."""
+SMALL = {1: jnp.uint8, 2: jnp.uint16}  # bytes of a dtype below a word -> what has its bits
 
 
 def width(like):

@@ -16,8 +16,7 @@ from jast._src.search.tree.run import Traced, TreeBatch
 
 __all__ = ["result", "traced_result"]
 
-MOMENTS = 200
-"""Of the history, at most."""
+MOMENTS = 200  # of the history, at most
 SPARE = 8
 """Distinct failures that are replayed beyond those that the archive keeps, as a few may no longer
 fail."""

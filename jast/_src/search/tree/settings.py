@@ -19,8 +19,7 @@ from jast._src.util.pytrees import count_numbers, select
 
 __all__ = ["PLAIN", "mode_settings", "problem_of"]
 
-SWITCHES = ("spread", "follow", "feed", "urgent")
-"""The settings of a mode beside ``widening`` and ``focus``."""
+SWITCHES = ("spread", "follow", "feed", "urgent")  # those of a mode beside widening and focus
 PLAIN = dict(spread=False, focus=1.0, follow=False, feed=False, urgent=False)
 """The settings of a mode that adds nothing to the published search."""
 
