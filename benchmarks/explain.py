@@ -111,7 +111,9 @@ def _on_fresh(found, p, cause, seed):
     """(precision, recall, whether a rule speaks of just what was planted)."""
     rng = np.random.default_rng([seed, 1 + cause])
     bad = p.episodes(p.failing(rng, cause, FRESH))
-    near, plain = (p.episodes(draw(rng, FRESH)) for draw in (_near(p, cause), _plain(p, cause)))
+    near = p.episodes(p.near(rng, cause, FRESH))
+    shape = FRESH, 50
+    plain = p.episodes(dict(delay=rng.exponential(0.2, shape), gust=rng.standard_normal(shape)))
     calm = [
         jax.tree.map(lambda a, e=e: a[np.flatnonzero(~np.asarray(e.failure))[: FRESH // 2]], e)
         for e in (near, plain)
@@ -127,17 +129,6 @@ def _on_fresh(found, p, cause, seed):
     # beside what was planted a rule may say that it is not about the other cause
     named = any(p.named(cause) <= s <= p.named(cause).union(*others) for s in speaks)
     return hits / max(hits + wrong, 1), hits / FRESH, named
-
-
-def _near(p, cause):
-    return lambda rng, n: p.near(rng, cause, n)
-
-
-def _plain(p, cause):
-    def draw(rng, n):
-        return dict(delay=rng.exponential(0.2, (n, 50)), gust=rng.standard_normal((n, 50)))
-
-    return draw
 
 
 def criticality(seeds, budget):
@@ -211,9 +202,8 @@ def _finite_differences(budget):
         for way in (1, -1):
             at = [0.1, 0.1]
             at[i] *= 1 + way * h
-            ends.append(
-                jast.estimate.failure_probability(jax.random.key(100 + i), lane(*at), 8 * budget)
-            )
+            key, sim = jax.random.key(100 + i), lane(*at)
+            ends.append(jast.estimate.failure_probability(key, sim, 8 * budget))
         slope = (ends[0].log_mean - ends[1].log_mean) / (2 * h * 0.1)
         error = math.hypot(*(e.relative_error for e in ends)) / (2 * h * 0.1)
         out[name] = slope, error
@@ -224,9 +214,8 @@ def _within_2(sim, truths, seeds, budget):
     names, z = list(truths), []
     for seed in range(seeds):
         key = jax.random.key(seed)
-        found = explain.sensitivity(
-            sim, jast.estimate.failure_probability(key, sim, budget), key=key
-        )
+        estimate = jast.estimate.failure_probability(key, sim, budget)
+        found = explain.sensitivity(sim, estimate, key=key)
         rows = {name: (slope, error) for name, _, slope, error, _ in found.rows}
         for name in names:
             truth, known = truths[name] if isinstance(truths[name], tuple) else (truths[name], 0.0)
@@ -319,27 +308,13 @@ def ferry(seeds, budget):
     return out
 
 
-PARTS = {
-    f.__name__: f
-    for f in (
-        minimal,
-        rules,
-        rules_of_estimates,
-        criticality,
-        sensitivity,
-        differential,
-        monitor,
-        ferry,
-    )
-}
+PARTS = (minimal, rules, rules_of_estimates, criticality, sensitivity, differential, monitor, ferry)
+PARTS = {f.__name__: f for f in PARTS}
 
 
 def run(parts, seeds, budget):
-    report = {}
     with warnings.catch_warnings(action="ignore"):
-        for name in parts:
-            report[name] = PARTS[name](seeds, budget)
-    return report
+        return {name: PARTS[name](seeds, budget) for name in parts}
 
 
 def lines(report, name=""):

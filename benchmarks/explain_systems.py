@@ -145,33 +145,18 @@ def _evaluate(s):
 
 def _planted(limits):
     """Fails where at the end all limits of a cause [k, steps, fields] were passed."""
-    return jast.Simulator(
-        init=_begin,
-        step=Partial(_step_of_causes, limits),
-        disturbance=_weather,
-        evaluate=_evaluate,
-        horizon=STEPS,
-        episodic=True,
-    )
-
-
-def _begin(x0):
-    return Short(jnp.zeros((), jnp.int32), jnp.full(2, NEVER))
+    init, step = Partial(_begin, jnp.full(2, NEVER)), Partial(_step_of_causes, limits)
+    return jast.Simulator(init, step, _weather, _evaluate, STEPS, episodic=True)
 
 
 def _any_step(limits):
     """Fails at the first step at which all limits [fields] are passed."""
-    return jast.Simulator(
-        init=_begin_at_once,
-        step=Partial(_step_of_any, limits),
-        disturbance=_weather,
-        evaluate=_evaluate,
-        horizon=STEPS,
-    )
+    init, step = Partial(_begin, jnp.full(2, 3.0)), Partial(_step_of_any, limits)
+    return jast.Simulator(init, step, _weather, _evaluate, STEPS)
 
 
-def _begin_at_once(x0):
-    return Short(jnp.zeros((), jnp.int32), jnp.full(2, 3.0))
+def _begin(short, x0):
+    return Short(jnp.zeros((), jnp.int32), short)
 
 
 def _step_of_any(limits, s, x):

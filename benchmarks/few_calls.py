@@ -21,7 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.tree_util import Partial
 
-from benchmarks.closed_loops import JUDGED
+from benchmarks.closed_loops import JUDGED, system
 from benchmarks.first_minute import lane
 from benchmarks.limit_states import four_branch, four_branch_probability
 from benchmarks.probability import summary
@@ -29,13 +29,7 @@ from benchmarks.sizes import add_choices, options, print_report, printer, size, 
 from benchmarks.time_to_answer import gayton
 from jast._src.core.simulator import Simulator
 from jast.blackbox import from_python
-from jast.distributions import (
-    Independent,
-    Joint,
-    MultivariateNormalDiag,
-    Normal,
-    TruncatedNormal,
-)
+from jast.distributions import Joint, MultivariateNormalDiag, Normal, TruncatedNormal
 from jast.estimate import failure_probability
 from jast.simulators import limit_state
 
@@ -165,9 +159,9 @@ def slow_lane() -> Simulator:
     return from_python(SlowLane, horizon=30, disturbance=Normal(0.0, 1.0))
 
 
-def plane(numbers: int) -> Simulator:
-    """The hyperplane 3.5 standard deviations out."""
-    return limit_state(Partial(hyperplane, jnp.asarray(3.5)), numbers)
+def plane(numbers: int, beta: float = 3.5) -> Simulator:
+    """The hyperplane so many standard deviations out."""
+    return limit_state(Partial(hyperplane, jnp.asarray(beta)), numbers)
 
 
 def first_of(depths: Any, ways: Any, x: Any) -> Any:
@@ -203,19 +197,7 @@ def diffusion(z: float, steps: int) -> Simulator:
         moved = -x - x * y, -4 * y + x**2
         return jnp.stack([x + dt * moved[0] + spread * w[0], y + dt * moved[1] + spread / 2 * w[1]])
 
-    def judge(s):
-        gap = z - s[0] - 2 * s[1]
-        return gap <= 0, jnp.maximum(gap, 0.0)
-
-    two = Independent(Normal(jnp.zeros(2), 1.0), 1)
-    return Simulator(
-        init=lambda x0: jnp.zeros(2),
-        step=step,
-        disturbance=lambda s: two,
-        evaluate=judge,
-        horizon=steps,
-        episodic=True,
-    )
+    return system([0.0, 0.0], step, lambda s: z - s[0] - 2 * s[1], 2, steps, episodic=True)
 
 
 def asian_option(z: Any) -> Any:
@@ -231,9 +213,7 @@ def asian_option(z: Any) -> Any:
 SYSTEMS = {
     "four-branch": System(lambda: branches(7.0, 3.0), 2.2227950662e-3),
     "RP8": System(lambda: limit_state(rp8, 6), 7.8995e-4),
-    "hyperplane 10": System(
-        lambda: limit_state(Partial(hyperplane, jnp.asarray(4.5)), 10), 3.3976731e-6
-    ),
+    "hyperplane 10": System(partial(plane, 10, 4.5), 3.3976731e-6),
     "curved 10": System(lambda: limit_state(curved, 10), 1.7912043e-6),
     "oscillator": System(lambda: limit_state(force(0.6, 0.1), 6), 9.133286e-6),
     "Booth": System(booth, 4.2964e-8, 999),
@@ -276,22 +256,19 @@ SYSTEMS |= FEWEST | MANY
 
 def report_of(system: System, seeds: int, budget: int | None) -> dict:
     """The report of some seeds."""
-    sim, runs, seconds, walls = system.make(), [], [], []
+    sim, calls = system.make(), budget or system.budget
     SlowLane.runs = 0
-    for seed in range(seeds):
-        key = jax.random.key(seed)
-        run = timed(partial(failure_probability, key, sim, budget or system.budget))
-        for parts, part in zip((runs, seconds, walls), run, strict=True):
-            parts.append(part)
+    keys = (jax.random.key(seed) for seed in range(seeds))
+    each = [timed(partial(failure_probability, key, sim, calls)) for key in keys]
+    runs, seconds, walls = zip(*each, strict=True)
     report = summary([(r, system.truth) for r in runs])
     near = [abs(r.mean / system.truth - 1) < 0.1 for r in runs]
     good = [r.mean / system.truth - 1 for r in runs if r.reliable]
-    calls = budget or system.budget
     return report | {
         "rms_unflagged": float(np.sqrt(np.mean(np.square(good)))) if good else None,
         "plain": math.sqrt((1 - system.truth) / system.truth / calls),
         "runs_counted": SlowLane.runs / seeds,
-        "budget": budget or system.budget,
+        "budget": calls,
         "within_10": sum(near),
         "cpu_s": float(np.median(seconds)),
         "cpu_s_first": seconds[0],

@@ -20,12 +20,11 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.tree_util import Partial
 
 import jast
 from benchmarks.closed_loops import system
 from benchmarks.sizes import add_choices, installed, options, print_report, printer, size
-from benchmarks.time_to_answer import toy_step, well_distance, well_step
+from benchmarks.time_to_answer import toy, well
 
 __all__ = ["SYSTEMS", "Diffusion"]
 
@@ -60,32 +59,12 @@ def channels_distance(s: Any) -> Any:
     return 2.1 - jnp.hypot(s[0] + 1, s[1])
 
 
-def toy_distance(s: Any) -> Any:
-    return 3.0 - s[0] - 2 * s[1]
-
-
-def _first(s: Any) -> Any:
-    return s[0]
-
-
-def _toy_score(s: Any) -> Any:
-    return -toy_distance(s)
-
-
+CHANNELS = system([-0.9, 0.1], channels_step, channels_distance, 2, 2000), 6.011e-5, 500
 SYSTEMS = {
-    "two channels": Diffusion(
-        system([-0.9, 0.1], channels_step, channels_distance, 2, 2000), 6.011e-5, 500
-    ),
-    "channels by x": Diffusion(
-        system([-0.9, 0.1], channels_step, channels_distance, 2, 2000), 6.011e-5, 500, _first
-    ),
-    "double well": Diffusion(system([-1.0, 0.0], well_step, well_distance, 2, 500), 1.342e-3, 750),
-    "toy": Diffusion(
-        system([0.0, 0.0], Partial(toy_step, 50), toy_distance, 2, 50, episodic=True),
-        1.0877e-5,
-        500,
-        _toy_score,
-    ),
+    "two channels": Diffusion(*CHANNELS),
+    "channels by x": Diffusion(*CHANNELS, score=lambda s: s[0]),
+    "double well": Diffusion(well(), 1.342e-3, 750),
+    "toy": Diffusion(toy(3.0, 50), 1.0877e-5, 500, score=lambda s: s[0] - 3.0 + 2 * s[1]),
 }
 
 

@@ -55,7 +55,8 @@ def lane(gain=0.3):
 
 def car():
     """The car of notebooks/quickstart: noise in two measurements, a leader that brakes."""
-    dt, noise = 0.5, jnp.array([2.0, 1.0])
+    dt, first = 0.5, [29.0, 25.0, 25.0, 0.0]
+    noise = MultivariateNormalDiag(jnp.zeros(2), jnp.array([2.0, 1.0]))
 
     def step(s, x):
         gap, speed, leader, time = s
@@ -64,13 +65,7 @@ def car():
         speed = jnp.maximum(speed + dt * jnp.clip(wish, -7.0, 2.0), 0.0)
         return jnp.stack([gap + dt * (leader - speed), speed, leader, time + dt])
 
-    return jast.Simulator(
-        init=lambda x0: jnp.array([29.0, 25.0, 25.0, 0.0]),
-        step=step,
-        disturbance=lambda s: MultivariateNormalDiag(jnp.zeros(2), noise),
-        evaluate=lambda s: (s[0] <= 0, jnp.maximum(s[0], 0.0)),
-        horizon=20,
-    )
+    return system(first, step, lambda s: s[0], 2, 20, disturbance=lambda s: noise)
 
 
 def drone():
@@ -85,17 +80,11 @@ def drone():
         speed = speed + dt * (thrust + 2.5 * gust - 0.1 * speed * jnp.linalg.norm(speed + 1e-6))
         return jnp.concatenate([place + dt * speed, speed])
 
-    def evaluate(s):
-        away = jnp.linalg.norm(s[:3] + 1e-6)
-        return away >= 2.0, jnp.maximum(2.0 - away, 0.0)
+    def distance(s):
+        return 2.0 - jnp.linalg.norm(s[:3] + 1e-6)
 
-    return jast.Simulator(
-        init=lambda x0: jnp.zeros(6),
-        step=step,
-        disturbance=lambda s: MultivariateNormalDiag(jnp.zeros(3), jnp.ones(3)),
-        evaluate=evaluate,
-        horizon=60,
-    )
+    noise = MultivariateNormalDiag(jnp.zeros(3), jnp.ones(3))
+    return system(jnp.zeros(6), step, distance, 3, 60, disturbance=lambda s: noise)
 
 
 def relay():
@@ -175,17 +164,11 @@ def branches(beta=4.0):
     unit = jnp.array([[1.0, 1.0], [1.0, -1.0], [-1.0, 1.0], [-1.0, -1.0]]) / math.sqrt(2)
     limits = beta + jnp.array([0.0, 0.1, 0.2, 0.3])
 
-    def evaluate(x):
-        short = jnp.min(limits - unit @ x)
-        return short <= 0, jnp.maximum(short, 0.0)
+    def distance(x):
+        return jnp.min(limits - unit @ x)
 
-    return jast.Simulator(
-        init=lambda x0: jnp.full(2, 0.0),
-        step=lambda s, x: x,
-        disturbance=lambda s: MultivariateNormalDiag(jnp.zeros(2), jnp.ones(2)),
-        evaluate=evaluate,
-        horizon=1,
-    )
+    noise = MultivariateNormalDiag(jnp.zeros(2), jnp.ones(2))
+    return system(jnp.zeros(2), lambda s, x: x, distance, 2, 1, disturbance=lambda s: noise)
 
 
 def wander():

@@ -28,15 +28,7 @@ from jast._src.normal_space.transform import dimension
 from jast._src.runtime.device import on_cpu, read_clock
 from jast.simulators import limit_state
 
-__all__ = [
-    "SYSTEMS",
-    "System",
-    "plain_draws",
-    "row_of",
-    "toy_step",
-    "well_distance",
-    "well_step",
-]
+__all__ = ["SYSTEMS", "System", "gayton", "plain_draws", "row_of", "toy", "well"]
 
 
 class System(NamedTuple):
@@ -98,7 +90,9 @@ def toy_step(steps, s, w):
     return jnp.stack([x_next, y + dt * (-4 * y + x**2) + 0.5 * deep * dt**0.5 * w[1]])
 
 
-def _toy(z, steps):
+def toy(z, steps):
+    """The same; it fails where x + 2 y >= z at the end."""
+
     def gap(s):
         return z - s[0] - 2 * s[1]
 
@@ -112,8 +106,13 @@ def well_step(s, w):
     return s + 0.01 * drift + (0.01 * 0.1) ** 0.5 * w
 
 
+def well():
+    """The same; it fails where the progress from one well to the other is .95."""
+    return system([-1.0, 0.0], well_step, well_distance, 2, 500)
+
+
 def well_distance(s):
-    """Of the progress from one well to the other, to .95."""
+    """Of that progress, to .95."""
 
     def bump(x):
         return 0.5 * jnp.exp(-8 * ((s[0] - x) ** 2 + s[1] ** 2))
@@ -137,11 +136,9 @@ SYSTEMS = {
     "plane of 100": _static(Partial(plane, 3.5), 100, 2.3262908e-4),
     "plane of 300": _static(Partial(plane, 3.5), 300, 2.3262908e-4),
     "slab": _static(slab, 5, 2.2402549e-7),
-    "toy, z 3, 100": System(_toy(3.0, 100), 9.6715e-6, 0.0, "diffusions"),
-    "toy, z 4, 50": System(_toy(4.0, 50), 2.346e-8, 0.0, "diffusions"),
-    "double well": System(
-        system([-1.0, 0.0], well_step, well_distance, 2, 500), 1.342e-3, 0.0, "diffusions"
-    ),
+    "toy, z 3, 100": System(toy(3.0, 100), 9.6715e-6, 0.0, "diffusions"),
+    "toy, z 4, 50": System(toy(4.0, 50), 2.346e-8, 0.0, "diffusions"),
+    "double well": System(well(), 1.342e-3, 0.0, "diffusions"),
 }
 METHODS = ("failure_probability", "stress", "subset")
 
@@ -191,11 +188,7 @@ def _subset(about, seed):
 
 def row_of(name: str, about: System, method: str, seeds: int) -> dict[str, Any]:
     """Figures of a method on a system over ``seeds`` keys."""
-    found, seconds = [], []
-    for seed in range(seeds):
-        one, spent = answers(method, about, seed)
-        found.append(one)
-        seconds.append(spent)
+    found, seconds = zip(*(answers(method, about, seed) for seed in range(seeds)), strict=True)
     if method == "subset":
         logs, errors = np.array(found).T
         reliable, evaluations = np.isfinite(logs), 0
