@@ -373,25 +373,9 @@ def ruins(rng, P):
     return ruin(up, start, goal, horizon=200), p[goal]
 
 
-FAMILIES = {
-    f.__name__: f
-    for f in (
-        two_sided,
-        scaled,
-        high_dimensional,
-        union,
-        intersection,
-        curved,
-        outside,
-        inside,
-        islands,
-        branches,
-        landings,
-        walks,
-        autoregressions,
-        ruins,
-    )
-}
+OF_LIMITS = (two_sided, scaled, high_dimensional, union, intersection, curved, outside, inside)
+OF_SYSTEMS = (landings, walks, autoregressions, ruins)
+FAMILIES = {f.__name__: f for f in (*OF_LIMITS, islands, branches, *OF_SYSTEMS)}
 
 
 def limit(family, seed, log10=(-12.0, -2.0)):
@@ -420,21 +404,17 @@ def check(family, seed, n=400_000):
     if not isinstance(easy, Limit):
         rate, truth = jast.nominal(jax.random.key(seed), easy[0], n).rate, easy[1]
         return [(rate - truth) / np.sqrt(truth * (1 - truth) / n)]
-    rate = np.mean(
-        [easy.batch(rng.standard_normal((10_000, easy.dimension))) <= 0 for _ in range(n // 10_000)]
-    )
-    scores, rare = (
-        [(rate - easy.truth) / np.sqrt(easy.truth * (1 - easy.truth) / n)],
-        limit(family, seed),
-    )
+    shape = 10_000, easy.dimension
+    rate = np.mean([easy.batch(rng.standard_normal(shape)) <= 0 for _ in range(n // 10_000)])
+    scores = [(rate - easy.truth) / np.sqrt(easy.truth * (1 - easy.truth) / n)]
+    rare = limit(family, seed)
     at_corner = rare.g is corner
     if rare.dimension <= 5 or at_corner:
         centre, spread = (rare.parameters[1] @ rare.parameters[0], 1.0) if at_corner else (0.0, 2.5)
         z = rng.standard_normal((n, rare.dimension))
         x = centre + spread * z
-        weights = (rare.batch(x) <= 0) * np.exp(
-            rare.dimension * np.log(spread) + 0.5 * np.sum(z**2 - x**2, -1)
-        )
+        log_weights = rare.dimension * np.log(spread) + 0.5 * np.sum(z**2 - x**2, -1)
+        weights = (rare.batch(x) <= 0) * np.exp(log_weights)
         scores.append((weights.mean() - rare.truth) / (weights.std() / n**0.5))
     return scores
 

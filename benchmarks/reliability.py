@@ -77,11 +77,11 @@ def nais(ot, event, budget, levels):
     return _sized(ot.NAIS(event, 0.1), budget // levels)
 
 
-def _form(ot, event, budget, count, search, starts):
-    """``search`` (FORM or MultiFORM) from each start, then importance sampling from an equal
-    mixture of N(design point, I); 0 where none was found.
+def _form(ot, counted, budget, search, starts):
+    """``search`` (FORM or MultiFORM, its defaults) from each start, then importance sampling from
+    an equal mixture of N(design point, I); 0 where none was found.
     """
-    parts = []
+    parts, event = [], counted.event
     for start in starts:
         solver = ot.AbdoRackwitz()
         solver.setStartingPoint(start)
@@ -92,47 +92,24 @@ def _form(ot, event, budget, count, search, starts):
             continue
         found = algorithm.getResult()
         found = found.getFORMResultCollection() if search is ot.MultiFORM else [found]
-        parts += [
-            ot.Normal(f.getStandardSpaceDesignPoint(), ot.CovarianceMatrix(len(start)))
-            for f in found
-        ]
+        points = (f.getStandardSpaceDesignPoint() for f in found)
+        parts += [ot.Normal(point, ot.CovarianceMatrix(len(start))) for point in points]
     if not parts:
         return 0.0, float("nan")
-    sampling = ot.ProbabilitySimulationAlgorithm(
-        event, ot.ImportanceSamplingExperiment(parts[0] if len(parts) == 1 else ot.Mixture(parts))
-    )
+    proposal = parts[0] if len(parts) == 1 else ot.Mixture(parts)
+    drawn = ot.ImportanceSamplingExperiment(proposal)
+    sampling = ot.ProbabilitySimulationAlgorithm(event, drawn)
     sampling.setMaximumCoefficientOfVariation(0.0)  # to the end of the budget
-    return _sized(sampling, budget - count())
+    return _sized(sampling, budget - counted.evaluations)
 
 
-def form_one(ot, event, budget, count, starts, random):
-    """FORM from one random start, N(0, I), and importance sampling at its design point."""
-    return _form(ot, event, budget, count, ot.FORM, random[:1])
-
-
-def form_16(ot, event, budget, count, starts, random):
-    """FORM from 16 random starts and importance sampling at all the points found: no routine of
-    OpenTURNS, but what a careful user would do with it.
-    """
-    return _form(ot, event, budget, count, ot.FORM, random)
-
-
-def form_by_hand(ot, event, budget, count, starts, random):
-    """FORM from ``starts``, given by hand for each mode, and importance sampling at all the points
-    found.
-    """
-    return _form(ot, event, budget, count, ot.FORM, starts)
-
-
-def multi_form(ot, event, budget, count, starts, random):
-    """MultiFORM, its defaults, from a random start, and importance sampling at all the points
-    found.
-    """
-    return _form(ot, event, budget, count, ot.MultiFORM, random[:1])
-
-
-LEVELS = {f.__name__: f for f in (subset, nais)}
-FORM = {f.__name__: f for f in (form_one, form_16, form_by_hand, multi_form)}
+LEVELS = {"subset": subset, "nais": nais}
+FORM = {  # name -> (search, how many starts of 16 random ones, N(0, I); None: those given by hand)
+    "form_one": ("FORM", 1),
+    "form_16": ("FORM", 16),  # no routine of OpenTURNS, but what a careful user would do with it
+    "form_by_hand": ("FORM", None),
+    "multi_form": ("MultiFORM", 1),
+}
 METHODS = LEVELS | FORM
 
 
@@ -148,17 +125,14 @@ def run(method, g_batch, dimension, budget, seed, levels=13, starts=()):
     ot.RandomGenerator.SetSeed(seed + 1)
     counted = Counted(g_batch, dimension)
     if method in LEVELS:
-        estimate, cov = METHODS[method](ot, counted.event, budget, levels)
+        estimate, cov = LEVELS[method](ot, counted.event, budget, levels)
     else:
-        random = np.random.default_rng(seed).standard_normal((16, dimension))
-        estimate, cov = METHODS[method](
-            ot, counted.event, budget, lambda: counted.evaluations, starts, random
-        )
-    return {
-        "estimate": float(estimate),
-        "evaluations": counted.evaluations,
-        "reported_cov": float(cov),
-    }
+        search, some = FORM[method]
+        if some is not None:
+            starts = np.random.default_rng(seed).standard_normal((16, dimension))[:some]
+        estimate, cov = _form(ot, counted, budget, getattr(ot, search), starts)
+    spent = counted.evaluations
+    return dict(estimate=float(estimate), evaluations=spent, reported_cov=float(cov))
 
 
 def _levels(truth):

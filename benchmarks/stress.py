@@ -116,9 +116,8 @@ def slow_cooling(key, sim, budget):
     slowly = int(10 * portfolio.COOLING_SHARE * budget)
     points, spent = cool_failures(for_cooling, sim, sample.points[rows], slowly, True)
     found_failures = explorers.failures_at(sim, points)
-    more = jast.search.refine(
-        for_refinement, sim, found_failures.episodes, budget=portfolio.REFINE_EVALUATIONS
-    )
+    few = portfolio.REFINE_EVALUATIONS
+    more = jast.search.refine(for_refinement, sim, found_failures.episodes, budget=few)
     return _best(more.failures), found.episodes + spent + more.episodes, None
 
 
@@ -133,40 +132,26 @@ def _scored(sim, z):
     return jax.vmap(play)(z)
 
 
-METHODS = {
-    f.__name__: f
-    for f in (
-        stress,
-        monte_carlo,
-        cem,
-        forest,
-        mcts,
-        cma_es,
-        gradient,
-        go_explore,
-        chain,
-        slow_cooling,
-    )
-}
+USUAL = stress, monte_carlo, cem, forest, mcts, cma_es
+SINGLE = gradient, go_explore, chain, slow_cooling
+"""Searches for some kinds of system or budget alone: measured where they are asked for."""
+METHODS = {f.__name__: f for f in USUAL + SINGLE}
 
 
 def _without(name, key, sim, budget):
     """`stress` where one of its explorers is not called."""
     none = explorers.ExplorerResult(empty(sim).episodes, 0, 0, 0)
     left_out = explorers.Explorer(lambda *_: none, None)
-    slow = left_out.run if name == SLOW else explorers.slow_cross_entropy
-    changed = {} if name == SLOW else {name: left_out}
-    with (
-        mock.patch.dict(explorers.EXPLORERS, changed),
-        mock.patch.object(portfolio, "slow_cross_entropy", slow),
-    ):
+    if name == SLOW:
+        patched = mock.patch.object(portfolio, "slow_cross_entropy", left_out.run)
+    else:
+        patched = mock.patch.dict(explorers.EXPLORERS, {name: left_out})
+    with patched:
         return stress(key, sim, budget)
 
 
 SLOW = "slow cross-entropy"
 LEFT_OUT = {f"- {name}": partial(_without, name) for name in (*explorers.EXPLORERS, SLOW)}
-SINGLE = "gradient", "go_explore", "chain", "slow_cooling"
-"""Searches for some kinds of system or budget alone: measured where they are asked for."""
 
 
 def _best(failures):
@@ -232,16 +217,15 @@ def table(report):
 def main(argv=None):
     parser = options(__doc__, "two systems, few evaluations")
     add_choices(parser, "--cases", CASES | LOOPS, "all but loops")
-    add_choices(parser, "--methods", METHODS, f"all but {', '.join(SINGLE)}")
+    usual = [f.__name__ for f in USUAL if f is not cma_es or installed("cma")]
+    add_choices(parser, "--methods", METHODS, ", ".join(usual))
     help = "stress with and without each of its explorers, in place of --methods"
     parser.add_argument("--leave-out", action="store_true", help=help)
     parser.add_argument("--budget", type=int, help="evaluations (default: 100,000)")
     parser.add_argument("--seeds", type=int, help="default: 20")
     args = parser.parse_args(argv)
     cases = args.cases or size(args, list(CASES), ["pedestrians", "latch"], ["branches"])
-    absent = () if installed("cma") else ("cma_es",)
-    there = [m for m in METHODS if m not in (*SINGLE, *absent)]
-    methods = args.methods or size(args, there, there, ["stress", "monte_carlo"])
+    methods = args.methods or size(args, usual, usual, ["stress", "monte_carlo"])
     methods = ["stress", *LEFT_OUT] if args.leave_out else methods
     budget = args.budget or size(args, 100_000, 10_000, 600)
     seeds = args.seeds or size(args, 20, 1, 1)
