@@ -131,6 +131,11 @@ class Case(NamedTuple):
     minimiser: np.ndarray | None
     budgets: tuple[int, int]
 
+    def distances(self, x):
+        """[n], from points [n, d] to the minimiser; None where there is none."""
+        away = None if self.minimiser is None else np.asarray(x) - self.minimiser
+        return None if away is None else np.linalg.norm(away, axis=-1)
+
 
 def _case(objective, d, mean, sd, minimum, minimiser, budgets):
     def fill(value):

@@ -43,19 +43,12 @@ def program(method, objective, samples, iterations, settings):
     """Runs of one method on one objective by keys, mean and covariance: a compiled program for all
     of them.
     """
-    search = functools.partial(
-        getattr(ce, method),
-        samples=samples,
-        elites=ELITES[samples],
-        iterations=iterations,
-        **dict(settings),
-    )
-    return jax.jit(
-        jax.vmap(
-            lambda key, mean, covariance: search(key, objective, (mean, covariance)),
-            (0, None, None),
-        )
-    )
+    sizes = dict(samples=samples, elites=ELITES[samples], iterations=iterations)
+
+    def search(key, mean, covariance):
+        return getattr(ce, method)(key, objective, (mean, covariance), **sizes, **dict(settings))
+
+    return jax.jit(jax.vmap(search, (0, None, None)))
 
 
 @functools.cache
@@ -63,15 +56,13 @@ def objective(function):
     return ce.sierra() if function.__name__ == "sierra" else functools.partial(function, np=jnp)
 
 
-def runs(method, case, seeds, seed=0, dtype=np.float64, **settings):
-    """A batch of runs of a case, `CEResult`."""
+def runs(method, case, seeds, dtype=np.float64, goal=None, **settings):
+    """A batch of runs of a case, `CEResult`; ``goal``: in place of its objective."""
     c = CASES[case]
-    run = program(method, objective(c.objective), *c.budgets, tuple(sorted(settings.items())))
-    return run(
-        jax.random.split(jax.random.key(seed), seeds),
-        c.mean.astype(dtype),
-        np.diag(c.sd.astype(dtype) ** 2),
-    )
+    goal = objective(c.objective) if goal is None else goal
+    run = program(method, goal, *c.budgets, tuple(sorted(settings.items())))
+    keys = jax.random.split(jax.random.key(0), seeds)
+    return run(keys, c.mean.astype(dtype), np.diag(c.sd.astype(dtype) ** 2))
 
 
 def row(values, distances=None, sierra=True):
@@ -81,26 +72,15 @@ def row(values, distances=None, sierra=True):
 
 
 def run_jast(method, case, seeds, **settings):
-    c = CASES[case]
     result = runs(method, case, seeds, **settings)
-    far = (
-        None
-        if c.minimiser is None
-        else np.linalg.norm(np.asarray(result.best_x) - c.minimiser, axis=-1)
-    )
+    far = CASES[case].distances(result.best_x)
     return row(result.best_value, far, case in SIERRA) | {"invalid": int(np.sum(result.invalid))}
 
 
 def run_peer(peer, case, seeds):
     found = peers.run(peer, case, range(seeds))
-    return row(found["values"], found["distances"], case in SIERRA) | {
-        "cpu_s": float(found["cpu_s"].mean())
-    }
-
-
-def compiled_for(run, *arguments):
-    """The program of a jitted function for such arguments, traced and compiled."""
-    return run.lower(*arguments).compile()
+    cpu = {"cpu_s": float(found["cpu_s"].mean())}
+    return row(found["values"], found["distances"], case in SIERRA) | cpu
 
 
 def speed(seeds, methods=METHODS):
@@ -110,9 +90,8 @@ def speed(seeds, methods=METHODS):
         run = program(method, ce.sierra(), 10, 10, ())
         c = {case: (CASES[case].mean, np.diag(CASES[case].sd ** 2)) for case in SIERRA[:2]}
         keys = jax.random.split(jax.random.key(1), seeds)
-        compiled, compile_cpu, compile_wall = timed(
-            functools.partial(compiled_for, run, keys, *c["sierra 1A"])
-        )
+        trace = functools.partial(run.lower, keys, *c["sierra 1A"])
+        compiled, compile_cpu, compile_wall = timed(lambda trace=trace: trace().compile())
         each = {
             case: min(cpu(functools.partial(compiled, keys, *start))[0] for _ in range(3)) / seeds
             for case, start in c.items()
@@ -131,21 +110,18 @@ def schedules(seeds, rates=(0.1, 0.2, 0.3), forms=("before", "after"), modes=("t
     ratchet of the elites.
     """
     out = {}
+    run = functools.partial(run_jast, "ce_surrogate", "sierra 1B", seeds)
     uneven = [
         (f"Geo({p}), {form}", ce.schedules.geometric(p, form)(100, 10))
         for form in forms
         for p in rates
     ]
     for mode in modes:
-        out[f"uniform, {mode}"] = run_jast("ce_surrogate", "sierra 1B", seeds, mode=mode)
+        out[f"uniform, {mode}"] = run(mode=mode)
         for name, counts in uneven:
-            out[f"{name}, {mode}"] = run_jast(
-                "ce_surrogate", "sierra 1B", seeds, mode=mode, schedule=counts
-            )
+            out[f"{name}, {mode}"] = run(mode=mode, schedule=counts)
     for name, counts in uneven[: len(rates)]:
-        out[f"{name}, thesis with ratchet"] = run_jast(
-            "ce_surrogate", "sierra 1B", seeds, mode="thesis", schedule=counts, ratchet=True
-        )
+        out[f"{name}, thesis with ratchet"] = run(mode="thesis", schedule=counts, ratchet=True)
     return out
 
 
@@ -198,13 +174,8 @@ def main(argv=None):
             other = f"  {name:34} median {r['median']:.3g}, mean {r['best']:.3g}"
             say(row_text(name, r) if name.startswith("sierra") else other)
         return print_report(args, report)
-    report = {
-        "seeds": seeds,
-        "speed": speed(seeds, methods),
-        "sierra": {},
-        "peers": {},
-        "others": {},
-    }
+    report = {"seeds": seeds, "speed": speed(seeds, methods)}
+    report |= {"sierra": {}, "peers": {}, "others": {}}
     say("speed: CPU seconds to compile, CPU ms of a run")
     for method, s in report["speed"].items():
         each = s["cpu_ms_a_seed"]
@@ -237,27 +208,18 @@ def main(argv=None):
         )
         jax.config.update("jax_enable_x64", False)
         for case in SIERRA[: 1 if args.smoke else 2]:
-            report["sierra"][f"{case}, ce_surrogate, float32"] = r = run_jast(
-                "ce_surrogate", case, seeds, dtype=np.float32
-            )
+            name = f"{case}, ce_surrogate, float32"
+            r = report["sierra"][name] = run_jast("ce_surrogate", case, seeds, dtype=np.float32)
             say(row_text(f"{case}, float32", r))
-            logged = program("ce_surrogate", ce.sierra(log=True), *CASES[case].budgets, ())
-            c = CASES[case]
-            found = logged(
-                jax.random.split(jax.random.key(0), seeds),
-                c.mean.astype(np.float32),
-                np.diag(c.sd.astype(np.float32) ** 2),
-            )
+            found = runs("ce_surrogate", case, seeds, np.float32, ce.sierra(log=True))
             x = np.asarray(found.best_x, float)
-            report["sierra"][f"{case}, ce_surrogate, float32, log"] = r = row(
-                c.objective(x), np.linalg.norm(x, axis=-1)
-            )
+            r = row(CASES[case].objective(x), CASES[case].distances(x))
+            report["sierra"][f"{name}, log"] = r
             say(row_text(f"{case}, float32, log=True", r))
         jax.config.update("jax_enable_x64", True)
         say("\nexperiment 2: schedules, CE-surrogate from 1B")
-        report["schedules"] = schedules(
-            seeds, *((0.1,), ("before",), ("default",)) if args.smoke else ()
-        )
+        few = ((0.1,), ("before",), ("default",)) if args.smoke else ()
+        report["schedules"] = schedules(seeds, *few)
         for name, r in report["schedules"].items():
             published = SCHEDULES[name.split(",")[0]] if name.endswith("thesis") else None
             say(row_text(name, r, published))
@@ -265,21 +227,14 @@ def main(argv=None):
     say("\nother objectives: median best value (mean)")
     others = [case for case in CASES if case not in SIERRA]
     for case in size(args, others, ("branin", "ackley 5", "levy 5"), ("paraboloid 2",)):
-        rows = {
-            method: run_jast(method, case, seeds)
-            for method in size(args, METHODS, METHODS[:2], METHODS[:1])
-        }
-        rows |= (
-            {"ce_surrogate, thesis": run_jast("ce_surrogate", case, seeds, mode="thesis")}
-            if not args.quick
-            else {}
-        )
+        some = size(args, METHODS, METHODS[:2], METHODS[:1])
+        rows = {method: run_jast(method, case, seeds) for method in some}
+        if not args.quick:
+            rows["ce_surrogate, thesis"] = run_jast("ce_surrogate", case, seeds, mode="thesis")
         rows |= {peer: run_peer(peer, case, seeds) for peer in cheap}
         report["others"][case] = rows
-        say(
-            f"  {case:13} "
-            + ", ".join(f"{name} {r['median']:.4g} ({r['best']:.4g})" for name, r in rows.items())
-        )
+        texts = (f"{name} {r['median']:.4g} ({r['best']:.4g})" for name, r in rows.items())
+        say(f"  {case:13} {', '.join(texts)}")
     if args.picture:
         picture(args.picture, report)
     print_report(args, report)
@@ -302,21 +257,14 @@ def picture(path, report):
     }
     with style.axes(None, (10.0, 3.7), columns=3, sharey=True) as axes:
         for ax, case in zip(axes, SIERRA, strict=True):
-            plot.convergence(
-                {
-                    name: runs(method, case, report["seeds"], mode=mode)
-                    for name, (method, mode) in shown.items()
-                },
-                axes=ax,
-            )
+            drawn = {
+                name: runs(method, case, report["seeds"], mode=mode)
+                for name, (method, mode) in shown.items()
+            }
+            plot.convergence(drawn, axes=ax)
             for peer, name, line in (("cma_es", "CMA-ES", "--"), ("direct", "DIRECT", ":")):
-                ax.axhline(
-                    report["peers"][f"{case}, {peer}"]["best"],
-                    color=style.INK,
-                    linestyle=line,
-                    linewidth=1.2,
-                    label=name,
-                )
+                best = report["peers"][f"{case}, {peer}"]["best"]
+                ax.axhline(best, color=style.INK, linestyle=line, linewidth=1.2, label=name)
             ax.set_title(case)
             ax.get_legend().remove()
         axes[0].set_ylabel("mean best value")

@@ -16,7 +16,7 @@ import numpy as np
 
 from benchmarks import cma_es as driver
 from benchmarks.cases import CASES
-from benchmarks.sizes import add_choices, options, print_report, printer, size, timed
+from benchmarks.sizes import add_choices, installed, options, print_report, printer, size, timed
 
 __all__ = ["PEERS", "run", "summary"]
 
@@ -85,13 +85,13 @@ def differential_evolution(seed, objective, mean, sd, budget):
     return _record(objective, budget, len(mean), search)
 
 
-def direct(seed, objective, mean, sd, budget, jitter=0.25):
+def direct(seed, objective, mean, sd, budget):
     """DIRECT (scipy, locally biased). It is deterministic, so the seed shifts the box by a uniform
-    draw of up to +- ``jitter`` sd in each coordinate.
+    draw of up to +- 0.25 sd in each coordinate.
     """
     from scipy import optimize
 
-    centre = mean + jitter * sd * np.random.default_rng(seed).uniform(-1, 1, len(mean))
+    centre = mean + 0.25 * sd * np.random.default_rng(seed).uniform(-1, 1, len(mean))
     bounds = list(zip(centre - 2 * sd, centre + 2 * sd))
 
     def search(evaluate):
@@ -102,12 +102,12 @@ def direct(seed, objective, mean, sd, budget, jitter=0.25):
     return _record(objective, budget, len(mean), search)
 
 
-def expected_improvement(seed, objective, mean, sd, budget, first=10, n_random=10_000, n_smart=10):
+def expected_improvement(seed, objective, mean, sd, budget):
     """Sequential Gaussian process with expected improvement (bayesian-optimization), Matern 5/2 in
     units of sd, y standardised at every step.
 
-    The ``first`` points are draws from the start distribution, the others maximise the acquisition
-    in the box: ``n_random`` candidates, the best ``n_smart`` of them improved by L-BFGS-B. One
+    The first ten points are draws from the start distribution, the others maximise the acquisition
+    in the box: 10,000 candidates, the best ten of them improved by L-BFGS-B. One
     lengthscale for all coordinates, of the greatest likelihood of six starts. All this is the
     library's default, only xi is 0.
     """
@@ -123,9 +123,10 @@ def expected_improvement(seed, objective, mean, sd, budget, first=10, n_random=1
         Matern(nu=2.5), alpha=1e-6, normalize_y=True, n_restarts_optimizer=5, random_state=state
     )
     acquisition = ExpectedImprovement(xi=0.0)
+    candidates = dict(n_random=10_000, n_smart=10, random_state=state)
 
     def search(evaluate):
-        z = rng.standard_normal((first, len(mean)))
+        z = rng.standard_normal((10, len(mean)))
         # it asks for a point of the box: in 40 dimensions ten draws may all lie outside of it
         z = list(z if (np.abs(z) <= 2).all(axis=1).any() else np.clip(z, -2, 2))
         value = [evaluate(mean + sd * point) for point in z]
@@ -135,11 +136,7 @@ def expected_improvement(seed, objective, mean, sd, budget, first=10, n_random=1
             # it maximises; EI in these units, or L-BFGS-B finds it flat
             for point, target in zip(z, (y.mean() - y) / (y.std() or 1.0)):
                 space.register(point, target)
-            z.append(
-                acquisition.suggest(
-                    gp, space, n_random=n_random, n_smart=n_smart, random_state=state
-                )
-            )
+            z.append(acquisition.suggest(gp, space, **candidates))
             value.append(evaluate(mean + sd * z[-1]))
 
     return _record(objective, budget, len(mean), search)
@@ -166,11 +163,7 @@ def run(peer, case, seeds):
         best = np.argmin(value)
         values.append(value[best])
         points.append(x[best])
-    distances = (
-        None
-        if case.minimiser is None
-        else np.linalg.norm(np.array(points) - case.minimiser, axis=-1)
-    )
+    distances = case.distances(points)
     return {"values": np.array(values), "distances": distances, "cpu_s": np.array(seconds)}
 
 
@@ -183,29 +176,13 @@ def summary(values, distances=None):
     def se(sample):
         return float(np.std(sample, ddof=1) / n**0.5) if n > 1 else float("nan")
 
-    report = {
-        "seeds": n,
-        "best": float(values.mean()),
-        "best_se": se(values),
-        "median": float(np.median(values)),
-    }
+    report = dict(seeds=n, best=float(values.mean()), best_se=se(values))
+    report |= dict(median=float(np.median(values)))
     if distances is not None:
         d = np.asarray(distances, float)
         rms = float(np.mean(d**2) ** 0.5)
-        report |= {
-            "distance": float(d.mean()),
-            "distance_se": se(d),
-            "rms": rms,
-            "F": 50**0.5 * rms,
-        }
+        report |= dict(distance=float(d.mean()), distance_se=se(d), rms=rms, F=50**0.5 * rms)
     return report
-
-
-def _version(package):
-    try:
-        return importlib.metadata.version(package)
-    except importlib.metadata.PackageNotFoundError:
-        return None
 
 
 def main(argv=None):
@@ -219,8 +196,10 @@ def main(argv=None):
     cases = args.cases or size(args, list(CASES), list(CASES), ["branin"])
     usual = [p for p in PEERS if p != "expected_improvement"]
     peers = args.peers or size(args, usual, usual, ["random_search", "differential_evolution"])
-    packages = ("numpy", "scipy", "scikit-learn", "cma", "bayesian-optimization")
-    report = {"versions": {p: _version(p) for p in packages}, "results": []}
+    packages = {"scikit-learn": "sklearn", "bayesian-optimization": "bayes_opt"}
+    packages |= {name: name for name in ("numpy", "scipy", "cma")}
+    there = [p for p, module in packages.items() if installed(module)]
+    report = {"versions": {p: importlib.metadata.version(p) for p in there}, "results": []}
     say(
         f"{'case':14}{'peer':24}{'mean best':>12}{'se':>10}{'median':>12}{'distance':>10}"
         f"{'se':>8}{'F':>8}{'CPU s':>9}"
