@@ -66,29 +66,16 @@ def nominal(scenario, kind, episodes, substeps):
 def share(failing):
     """How many of several runs found a collision."""
     found, n = int(np.sum(failing)), len(failing)
-    return {
-        "runs": n,
-        "failing": found,
-        "share": found / n,
-        "share_95": list(clopper_pearson(found, n)),
-    }
+    ends = list(clopper_pearson(found, n))
+    return {"runs": n, "failing": found, "share": found / n, "share_95": ends}
 
 
 def search(scenario, kind, trees, substeps, heads=None, prunes=PRUNES):
     """Trees of the default search that find a collision."""
     sim = colav(scenario, kind, substeps=substeps)
-    grow = functools.partial(
-        jast.search.forest,
-        jax.random.key(0),
-        sim,
-        trees=trees,
-        prunes=prunes,
-        simulations=SIMULATIONS,
-        reward=REWARD,
-        actions=jast.actions.samples(),
-        heads=heads,
-    )
-    result, seconds, _ = timed(grow)
+    sizes = dict(trees=trees, prunes=prunes, simulations=SIMULATIONS)
+    how = dict(reward=REWARD, actions=jast.actions.samples(), heads=heads)
+    result, seconds, _ = timed(lambda: jast.search.forest(jax.random.key(0), sim, **sizes, **how))
     best = {"best": float(result.best.reward), "best_distance_m": float(result.best.distance)}
     cost = {"episodes": result.episodes, "steps": result.steps, "cpu_s": seconds}
     return share(result.failing_per_tree) | best | cost
@@ -99,13 +86,11 @@ def random_search(scenario, kind, runs, substeps, episodes=PRUNES * SIMULATIONS)
     sim = colav(scenario, kind, substeps=substeps)
 
     def one(key):
-        return jast.search.monte_carlo(key, sim, episodes=episodes, reward=REWARD).failing_per_tree[
-            0
-        ]
+        found = jast.search.monte_carlo(key, sim, episodes=episodes, reward=REWARD)
+        return found.failing_per_tree[0]
 
-    return share(
-        jax.jit(lambda keys: jax.lax.map(one, keys))(jax.random.split(jax.random.key(1), runs))
-    )
+    keys = jax.random.split(jax.random.key(1), runs)
+    return share(jax.jit(lambda keys: jax.lax.map(one, keys))(keys))
 
 
 def memoization(
@@ -148,16 +133,11 @@ def picture(rows, path):
         "node": "states at every node",
     }
     with style.axes(None, (6.8, 4.2)) as ax:
-        for (name, label), colour, marker in zip(
-            labels.items(), style.COLOURS, "osD^", strict=False
-        ):
-            ax.loglog(
-                [r["substeps"] for r in rows],
-                [r["us"][name] for r in rows],
-                color=colour,
-                marker=marker,
-                label=label,
-            )
+        substeps = [r["substeps"] for r in rows]
+        looks = zip(labels.items(), style.COLOURS, "osD^", strict=False)
+        for (name, label), colour, marker in looks:
+            us = [r["us"][name] for r in rows]
+            ax.loglog(substeps, us, color=colour, marker=marker, label=label)
         ax.set(xlabel="substeps of a search step", ylabel="CPU time of a simulation (µs)")
         ax.legend(loc="upper left")
         ax.figure.savefig(path, dpi=120)
@@ -184,11 +164,7 @@ def main(argv=None):
 
     report = {"nominal": {}, "searches": {}, "memoization": []}
     measure = in_this_process if args.smoke else in_fresh_process
-
-    say(
-        "nominal: least distance undisturbed, and failures when disturbances are drawn from their"
-        " densities"
-    )
+    say("nominal: least distance undisturbed, and failures among episodes as the model draws them")
     few = [*SCENARIOS][:1] if args.smoke else SCENARIOS
     for scenario in () if args.memoization else few:
         for kind in size(args, (*ALL, ALL), ("delay", "steering"), ("delay",)):

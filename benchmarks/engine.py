@@ -8,6 +8,7 @@ more it cuts kernels over threads, which wait for each other at the cost of CPU 
 own threads, which use all cores, are measured in ``cores``.
 """
 
+import dataclasses
 import functools
 import json
 import time
@@ -31,7 +32,6 @@ from benchmarks.sizes import (
     timed,
 )
 from jast._src.core.counter_prng import tree_keys
-from jast._src.core.simulator import Simulator
 from jast._src.core.transition import Progress, begin
 from jast._src.search.forest import MODES
 from jast._src.search.tree import run
@@ -102,9 +102,7 @@ def rates(repeats, lanes=200, prunes=18, simulations=500, plain_trees=3):
     keys, total = tree_keys(jax.random.key(0), lanes), prunes * simulations
     problems = {mode: problem(total, mode) for mode in MODES}
     children = {mode: int(p.settings.widths.max()) for mode, p in problems.items()}
-    runs = {
-        "rollouts": lambda: rollouts(problems["paper"], keys, 2 * simulations),
-    }
+    runs = {"rollouts": lambda: rollouts(problems["paper"], keys, 2 * simulations)}
     for mode in ("paper", "default"):
         of_mode = problems[mode], keys, prunes, simulations, children[mode]
         runs[f"forest, {mode}"] = functools.partial(whole, *of_mode)
@@ -148,23 +146,16 @@ def capacity(repeats, lanes=200, few=500, many=10_000):
 
 def cores(repeats, trees=200, prunes=6, simulations=500):
     """How many times faster two threads, of half of the trees each, are than one, in wall time."""
-    search = functools.partial(
-        jast.search.forest,
-        jax.random.key(0),
-        jast.simulators.ferry(),
-        trees=trees,
-        prunes=prunes,
-        simulations=simulations,
-        reward=REWARD,
-        actions=BOX,
-        mode="paper",
-        lanes=trees // 2,
-    )
+    sizes = dict(trees=trees, prunes=prunes, simulations=simulations, lanes=trees // 2)
+    how = dict(reward=REWARD, actions=BOX, mode="paper")
+    key, sim = jax.random.key(0), jast.simulators.ferry()
+
+    def search(threads):
+        found = jast.search.forest(key, sim, threads=threads, **sizes, **how)
+        return found.best_reward_per_tree
+
     pairs = [
-        (
-            cpu(lambda: search(threads=1).best_reward_per_tree)[1],
-            cpu(lambda: search(threads=2).best_reward_per_tree)[1],
-        )
+        [cpu(functools.partial(search, threads))[1] for threads in (1, 2)]
         for _ in range(repeats + 1)
     ][1:]
     return {"two_to_one": max(one / two for one, two in pairs), "pairs_wall_s": pairs}
@@ -196,16 +187,7 @@ def slow_ferry(substeps):
     program serves every number of substeps.
     """
     sim = jast.simulators.ferry()
-    step = Partial(_slow_step, sim.step, jnp.int32(substeps))
-    return Simulator(
-        sim.init,
-        step,
-        sim.disturbance,
-        sim.evaluate,
-        sim.horizon,
-        is_terminal=sim.is_terminal,
-        observe=sim.observe,
-    )
+    return dataclasses.replace(sim, step=Partial(_slow_step, sim.step, jnp.int32(substeps)))
 
 
 def _slow_step(step, substeps, state, a):
@@ -262,23 +244,14 @@ def peer(repeats, lanes=200, simulations=500):
             after = take(p, at.level, at.progress, ((), (a.astype(jnp.float32) + 0.5) / 10))
             gone = at.progress.done
             after = jax.tree.map(lambda x, y: jnp.where(gone, x, y), at.progress, after)
-            return (
-                after.reward - jnp.where(gone, after.reward, at.progress.reward),
-                gone,
-                At(at.level + 1, after),
-            )
+            gain = after.reward - jnp.where(gone, after.reward, at.progress.reward)
+            return gain, gone, At(at.level + 1, after)
 
         reward, gone, after = jax.vmap(one)(action, embedding)
-        shape = (*action.shape, 10)
-        return (
-            mctx.RecurrentFnOutput(
-                reward=reward,
-                discount=jnp.where(gone, 0.0, 1.0),
-                prior_logits=jnp.zeros(shape),
-                value=jnp.zeros(action.shape),
-            ),
-            after,
-        )
+        shape = action.shape
+        found = dict(prior_logits=jnp.zeros((*shape, 10)), value=jnp.zeros(shape))
+        discount = jnp.where(gone, 0.0, 1.0)
+        return mctx.RecurrentFnOutput(reward=reward, discount=discount, **found), after
 
     @jax.jit
     def policy(key):
@@ -287,15 +260,12 @@ def peer(repeats, lanes=200, simulations=500):
         root = mctx.RootFnOutput(
             prior_logits=jnp.zeros((lanes, 10)), value=jnp.zeros(lanes), embedding=start
         )
-        return mctx.muzero_policy(
-            (), key, root, recurrent, simulations, dirichlet_fraction=0.0
-        ).action
+        settings = dict(dirichlet_fraction=0.0)
+        return mctx.muzero_policy((), key, root, recurrent, simulations, **settings).action
 
     keys = tree_keys(jax.random.key(0), lanes)
-    theirs, ours = (
-        lambda: policy(jax.random.key(1)),
-        lambda: first_turn(p, keys, simulations, simulations),
-    )
+    theirs = functools.partial(policy, jax.random.key(1))
+    ours = functools.partial(first_turn, p, keys, simulations, simulations)
     cpu(theirs), ours()
     pairs = [(cpu(theirs)[0], ours()[0]) for _ in range(repeats)]
     n = lanes * simulations

@@ -131,11 +131,8 @@ def variant(name, mode, sizes):
     """A row of Table 1."""
     s0, heads = jast.simulators.ferry(), VARIANTS[name]
     if name == "MCTS-SA":
-        more = dict(mode=mode, reward=REWARD, actions=BOX)
-        total = 18 * sizes.published
-        return functools.partial(
-            jast.search.mcts, sim=s0, trees=sizes.trees, simulations=total, **more
-        )
+        more = dict(mode=mode, reward=REWARD, actions=BOX, simulations=18 * sizes.published)
+        return functools.partial(jast.search.mcts, sim=s0, trees=sizes.trees, **more)
     # alone, the paper's value network is not trained
     published = dict(train=False) if heads == "value" else dict(round=sizes.round)
     trees = sizes.taught_trees if mode == "paper" and name.startswith("RP") else sizes.trees
@@ -199,13 +196,8 @@ def published():
         return {name: outcome(np.array(bests[name])) for name in VARIANTS}
 
     def row(rate, mean, best):
-        return dict(
-            trees=200,
-            rate=rate / 100,
-            rate_95=list(clopper_pearson(round(2 * rate), 200)),
-            mean_best=mean,
-            best=best,
-        )
+        ends = list(clopper_pearson(round(2 * rate), 200))
+        return dict(trees=200, rate=rate / 100, rate_95=ends, mean_best=mean, best=best)
 
     return {name: row(*TABLE[name]) for name in VARIANTS}
 
@@ -245,19 +237,14 @@ def kinds(names, sim, **settings):
 
 def warm_start(sizes, seeds, say):
     """System -> rows of small searches that start with heads learned on S0, or without."""
-    learn = forest(
-        jast.simulators.ferry(), "both", trees=sizes.trees, simulations=sizes.simulations
-    )
+    s0, n = jast.simulators.ferry(), sizes.simulations
+    learn = forest(s0, "both", trees=sizes.trees, simulations=n)
     taught = f"{sizes.trees} trees of 18 x {sizes.simulations} on S0"
     heads = [learn(jax.random.key(seed)).heads for seed in seeds]
     later, out = [seed + 1000 for seed in seeds], {}
     for x in sizes.starts:
-        search = functools.partial(
-            forest,
-            jast.simulators.ferry(adversary=(x, 0.0)),
-            trees=sizes.warm_trees,
-            simulations=sizes.small,
-        )
+        few = dict(trees=sizes.warm_trees, simulations=sizes.small)
+        search = functools.partial(forest, jast.simulators.ferry(adversary=(x, 0.0)), **few)
         rows = {
             "none": search(),
             "cold": search("both"),
@@ -285,12 +272,9 @@ def slowed(sizes, seeds, say):
     for n in sizes.substeps:
         sim = engine.slow_ferry(n)
         cost = episode_cost(sim, max(4, 1000 // (3 + n)))
-        rows = block(
-            f"{n} substeps, 18 x {sizes.small}: {cost:.2f} us an episode",
-            kinds(("none", "rollout", "both"), sim, trees=sizes.trees, simulations=sizes.small),
-            seeds,
-            say,
-        )
+        few = dict(trees=sizes.trees, simulations=sizes.small)
+        title = f"{n} substeps, 18 x {sizes.small}: {cost:.2f} us an episode"
+        rows = block(title, kinds(("none", "rollout", "both"), sim, **few), seeds, say)
         out.append({"substeps": n, "episode_cpu_us": cost, "rows": rows})
     return out
 
@@ -307,45 +291,23 @@ def draw(out, path):
     with styled():
         figure, (left, right) = plt.subplots(1, 2, figsize=(9.6, 3.9), layout="constrained")
         for colour, marker, name in zip(COLOURS, "os^", ("none", "rollout", "both"), strict=False):
-            style = dict(
-                color=colour,
-                marker=marker,
-                markersize=5,
-                capsize=2.5,
-                label={"none": "no heads", "both": "both heads"}.get(name, "rollout head"),
-            )
+            label = {"none": "no heads", "both": "both heads"}.get(name, "rollout head")
+            style = dict(color=colour, marker=marker, markersize=5, capsize=2.5, label=label)
             points = [(p["episode_cpu_us"], p["rows"][name]) for p in out["slow_simulator"]]
-            bars(
-                left,
-                [
-                    (x, r["failing_trees_per_cpu_s"], r["failing_trees_per_cpu_s_95"])
-                    for x, r in points
-                ],
-                style,
-            )
+            bars(left, points, "failing_trees_per_cpu_s", 1, style)
             points = [
                 (18 * n, rows[name]) for n, rows in out["equal_cpu_time"].items() if name in rows
             ]
-            bars(
-                right,
-                [(x, 100 * r["rate"], [100 * v for v in r["rate_95"]]) for x, r in points],
-                style,
-            )
-        left.set(
-            xscale="log",
-            yscale="log",
-            xlabel="CPU time of a simulator's episode, microseconds",
-            ylabel="failing trees per CPU second",
-        )
+            bars(right, points, "rate", 100, style)
+        left.set(xscale="log", xlabel="CPU time of a simulator's episode, microseconds")
+        left.set(yscale="log", ylabel="failing trees per CPU second")
         left.set_title("Trees of 18 x 50 simulations")
         for axis in (left.xaxis, left.yaxis):
             axis.set_major_formatter("{x:g}")
-        right.set(
-            xscale="log", ylim=(0, 102), xlabel="simulations a tree", ylabel="failing trees, %"
-        )
-        right.set_xticks(
-            [18 * n for n in out["equal_cpu_time"]], [str(18 * n) for n in out["equal_cpu_time"]]
-        )
+        right.set(xscale="log", xlabel="simulations a tree")
+        right.set(ylim=(0, 102), ylabel="failing trees, %")
+        ticks = [18 * n for n in out["equal_cpu_time"]]
+        right.set_xticks(ticks, map(str, ticks))
         right.minorticks_off()
         right.set_title("Trees of 18 roots on S0")
         left.legend(loc="lower left")
@@ -353,10 +315,12 @@ def draw(out, path):
         plt.close(figure)
 
 
-def bars(ax, points, style):
-    """A line through (x, y, (low, high)) with the intervals as bars."""
+def bars(ax, points, name, scale, style):
+    """A line through the number ``name`` of (x, row) with its intervals as bars."""
     if points:
-        x, y, ends = (np.array(column) for column in zip(*points, strict=True))
+        x, rows = zip(*points, strict=True)
+        y = scale * np.array([r[name] for r in rows])
+        ends = scale * np.array([r[f"{name}_95"] for r in rows])
         ax.errorbar(x, y, np.abs(ends.T - y), **style)
 
 
@@ -364,12 +328,8 @@ def report(args):
     """Measure, print and draw what the arguments of `benchmarks.ferry` ask for."""
     sizes = size(args, Sizes(), QUICK, SMOKE)
     if args.trees:
-        sizes = sizes._replace(
-            trees=args.trees,
-            taught_trees=args.trees,
-            budget_trees=args.trees,
-            warm_trees=max(1, args.trees // 5),
-        )
+        same = dict.fromkeys(("trees", "taught_trees", "budget_trees"), args.trees)
+        sizes = sizes._replace(warm_trees=max(1, args.trees // 5), **same)
     seeds = range(args.seed, args.seed + (args.seeds or sizes.seeds))
     say = printer(args)
     rows = published()
