@@ -10,6 +10,7 @@ one call for all seeds, compilation included.
 """
 
 import warnings
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -83,7 +84,7 @@ def searches(evaluations, seeds):
 
 def mean(values):
     """The mean over seeds and its standard error; None where there are no values."""
-    values = np.asarray([v for v in values if v is not None and np.isfinite(v)], float)
+    values = np.asarray([v for v in values if np.isfinite(v)], float)
     if not len(values):
         return None
     return {
@@ -96,33 +97,27 @@ def quantiles(shares):
     """The mean of the shares of seeds, and what a tenth, a half and nine tenths of them, and all,
     do not exceed.
     """
-    at = np.quantile(shares, (0.1, 0.5, 0.9, 1.0))
-    return dict(
-        zip(("mean", "10 %", "median", "90 %", "greatest"), map(float, (shares.mean(), *at)))
-    )
+    at = np.quantile(shares, (0.1, 0.5, 0.9, 1.0)).tolist()
+    names = "mean", "10 %", "median", "90 %", "greatest"
+    return dict(zip(names, (float(shares.mean()), *at), strict=True))
 
 
 def by_seed(trials, seeds):
     """`Trials` [evaluations, seeds]; Monte Carlo's one tree is cut into seeds."""
-    return (
-        trials
-        if trials.reward.shape[1] == seeds
-        else jax.tree.map(lambda a: a.reshape(seeds, -1).T, trials)
-    )
+    if trials.reward.shape[1] == seeds:
+        return trials
+    return jax.tree.map(lambda a: a.reshape(seeds, -1).T, trials)
 
 
 def summary(result, seeds, baseline=None):
     """The table's row of one search; ``baseline``: mean log p of Monte Carlo's failures."""
-    t = by_seed(result.trials, seeds)
-    lanes = range(seeds)
-    failures, first = (
-        t.failure.sum(0),
-        [int(f.argmax()) + 1 if f.any() else None for f in t.failure.T],
-    )
+    t, lanes = by_seed(result.trials, seeds), range(seeds)
+    failures = t.failure.sum(0)
+    first = [int(f.argmax()) + 1 if f.any() else np.inf for f in t.failure.T]
     valid = t.ran & np.isfinite(t.distance)
     distances = [t.distance[valid[:, k], k] for k in lanes]
     log_p = [t.log_prob[t.failure[:, k], k] for k in lanes]
-    every = np.concatenate(log_p)
+    every, likely = np.concatenate(log_p), [p.mean() if len(p) else np.nan for p in log_p]
     return {
         "failures": mean(failures),
         "failures_median": float(np.median(failures)),
@@ -130,17 +125,13 @@ def summary(result, seeds, baseline=None):
         "share_of_simulations": float(failures.mean() / len(t.reward)),
         "with_repetitions": quantiles((t.failure | t.repeated).mean(0)),
         "seeds_without_failure": int((failures == 0).sum()),
-        "first_failure_median": float(np.median([np.inf if f is None else f for f in first])),
+        "first_failure_median": float(np.median(first)),
         "distance_mean": mean([d.mean() for d in distances]),
         "distance_sd": mean([d.std() for d in distances]),
         "distance_least": mean([d.min() for d in distances]),
-        "log_p_of_failures": mean([p.mean() if len(p) else None for p in log_p]),
+        "log_p_of_failures": mean(likely),
         "log_p_greatest": float(every.max()) if len(every) else None,
-        "log_p_less_monte_carlo": (
-            None
-            if baseline is None
-            else mean([p.mean() - baseline if len(p) else None for p in log_p])
-        ),
+        "log_p_less_monte_carlo": None if baseline is None else mean(np.array(likely) - baseline),
         "invalid": int(result.invalid),
     }
 
@@ -148,23 +139,19 @@ def summary(result, seeds, baseline=None):
 def run(evaluations, seeds, control_seeds, say, key=0, names=None):
     """The table; ``names``: of these searches alone."""
     keys, out, baseline = jax.random.split(jax.random.key(key), 7), {}, None
-    for k, (name, (search, settings)) in zip(
-        keys, searches(evaluations, seeds).items(), strict=True
-    ):
+    table = searches(evaluations, seeds).items()
+    for k, (name, (search, settings)) in zip(keys, table, strict=True):
         if names and name not in names:
             continue
-        result, seconds, _ = timed(
-            lambda search=search, k=k, settings=settings: search(k, fms(**settings))
-        )
+        result, seconds, _ = timed(partial(search, k, fms(**settings)))
         out[name] = summary(result, seeds, baseline) | {"cpu_s": seconds}
         if name == "monte carlo":
             t = result.trials
             baseline = float(t.log_prob[t.failure].mean())
             out[name] |= {"log_p_less_monte_carlo": mean([0.0])}
         say(line(name, out[name]))
-    for k, (name, (search, settings)) in zip(
-        keys, searches(evaluations, control_seeds).items(), strict=True
-    ):
+    table = searches(evaluations, control_seeds).items()
+    for k, (name, (search, settings)) in zip(keys, table, strict=True):
         if name in out:
             control = search(k, fms(fixed=True, **settings))
             out[name]["control_failures"] = int(control.failures.seen)
@@ -178,6 +165,14 @@ HEADER = (
 )
 
 
+def told(v, digits=3):
+    """A `mean`, or a number, in words."""
+    if not isinstance(v, dict):
+        return "-" if v is None else f"{v:.{digits}f}"
+    error = "" if v["se"] is None else f" +- {v['se']:.{digits}f}"
+    return f"{v['mean']:.{digits}f}{error}"
+
+
 def spread(shares):
     """`quantiles` in words."""
     mean, *rest = (f"{100 * v:.1f}" for v in shares.values())
@@ -186,15 +181,7 @@ def spread(shares):
 
 def line(name, row):
     """A row of the table in words."""
-
-    def of(v, digits=1):
-        return (
-            "-"
-            if v is None
-            else f"{v['mean']:.{digits}f}"
-            + (f" +- {v['se']:.{digits}f}" if v["se"] is not None else "")
-        )
-
+    of = partial(told, digits=1)
     return (
         f"{name:15} {of(row['failures']):>16} {row['failures_median']:7.0f}"
         f" {100 * row['share_of_simulations']:6.2f}% {row['first_failure_median']:7.0f}"

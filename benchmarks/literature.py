@@ -17,10 +17,9 @@ from jax.tree_util import Partial
 from scipy import stats
 
 import jast
-from benchmarks.limit_states import Case
 from jast import distributions as D
 
-__all__ = ["CASES", "collision_avoidance", "literature_cases", "table"]
+__all__ = ["CASES", "collision_avoidance", "table"]
 
 
 def one_step(noise: Any, g: Callable) -> jast.Simulator:
@@ -187,8 +186,3 @@ CASES: dict[str, tuple[Callable, float]] = {
     "Himmelblau": (himmelblau, himmelblau_probability()),
     "collision avoidance": (collision_avoidance, 7255 / 4e7),
 }
-
-
-def literature_cases() -> list[Case]:
-    """All of `CASES`."""
-    return [Case(name, make(), truth) for name, (make, truth) in CASES.items()]

@@ -12,11 +12,10 @@ from jax.tree_util import Partial
 from scipy import stats
 
 import jast
-from benchmarks.limit_states import Case
 from jast import distributions as D
 from jast.simulators import autoregression, limit_state
 
-__all__ = ["CASES", "markov_cases"]
+__all__ = ["CASES"]
 
 
 class Sum(NamedTuple):
@@ -299,8 +298,3 @@ CASES: dict[str, tuple[Callable, float]] = {
         float(-np.expm1(60 * np.log1p(-stats.norm.sf(5.0)))),
     ),
 }
-
-
-def markov_cases() -> list[Case]:
-    """All of ``CASES``: a list of `Case`."""
-    return [Case(name, make(), truth) for name, (make, truth) in CASES.items()]

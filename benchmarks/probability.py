@@ -23,11 +23,11 @@ from scipy import stats
 
 import jast
 from benchmarks import reliability
-from benchmarks.limit_states import FAMILIES, cases, draw
-from benchmarks.literature import literature_cases
-from benchmarks.markov_systems import markov_cases
+from benchmarks.limit_states import FAMILIES, Case, cases, draw
+from benchmarks.literature import CASES as LITERATURE
+from benchmarks.markov_systems import CASES as MARKOV
 from benchmarks.sizes import add_choices, options, print_report, printer, size, timed
-from benchmarks.structural import structural_cases
+from benchmarks.structural import PROBLEMS
 from jast._src.core.policy import Policy
 from jast._src.distributions.mixtures import blend
 from jast.distributions import Normal
@@ -47,23 +47,15 @@ PARTS = ("landing", "range", "policy", "default", "cases", "coverage")
 def both_traces(b=1.0):
     """The landing and its two design points as a proposal."""
     sim = jast.simulators.landing(b=b)
-    traces = [
-        jast.replay(
-            sim,
-            jnp.full(10, side * b * 1.001 * 0.0009 / 0.019),
-            jnp.float32(side * b * 1.001 * 0.01 / 0.019),
-        )
-        for side in (1, -1)
-    ]
-    return sim, trace_proposal(sim, traces)
+    ends = [side * b * 1.001 for side in (1, -1)]
+    points = [(jnp.full(10, v * 0.0009 / 0.019), jnp.float32(v * 0.01 / 0.019)) for v in ends]
+    return sim, trace_proposal(sim, [jast.replay(sim, *point) for point in points])
 
 
 def _to_the_edge(s, t):
     """The best deterministic policy: the rest of the way in equal steps."""
-    return Normal(
-        (jnp.where(s.x2 >= 0, 1.0, -1.0) - s.x2) / (10 - t).astype(s.x2.dtype),
-        jnp.ones_like(s.x2) * 0.03,
-    )
+    rest = jnp.where(s.x2 >= 0, 1.0, -1.0) - s.x2
+    return Normal(rest / (10 - t).astype(s.x2.dtype), jnp.ones_like(s.x2) * 0.03)
 
 
 def _two_starts(s0):
@@ -83,10 +75,8 @@ def landing(seeds, samples=100_000, many=2_000_000):
         runs = [importance(jax.random.key(seed), sim, proposal, samples) for seed in range(seeds)]
         key = jax.random.key(seeds)
         _, cpu, wall = timed(partial(importance, key, sim, proposal, many))
-        out[name] = summary([(r, LANDING) for r in runs]) | {
-            "traces_per_cpu_s": many / cpu,
-            "traces_per_s": many / wall,
-        }
+        speed = dict(traces_per_cpu_s=many / cpu, traces_per_s=many / wall)
+        out[name] = summary([(r, LANDING) for r in runs]) | speed
     return out
 
 
@@ -99,14 +89,9 @@ def to_small(samples=262_144):
         sim, proposal = both_traces(b)
         r = importance(jax.random.key(1), sim, proposal, samples)
         log_p = float(np.log(2) + stats.norm.logsf(b / np.sqrt(0.019)))
-        rows.append(
-            {
-                "b": b,
-                "log10_P": log_p / np.log(10),
-                "error": float(np.expm1(r.log_mean - log_p)),
-                "relative_error": r.relative_error,
-            }
-        )
+        error = float(np.expm1(r.log_mean - log_p))
+        row = dict(b=b, log10_P=log_p / np.log(10), error=error, relative_error=r.relative_error)
+        rows.append(row)
     return rows
 
 
@@ -128,28 +113,24 @@ def policies(seeds, episodes, systems, samples=100_000, methods=("sac", "ppo")):
             runs.append((r, truth))
             upper = np.nan
             if system == "landing" and r.failures_seen:
-                found = jast.estimate.failure_samples(
-                    jax.random.key(200 + seed), sim, proposal, 500, moves=0
-                ).failures
+                draw = partial(jast.estimate.failure_samples, jax.random.key(200 + seed), sim)
+                found = draw(proposal, 500, moves=0).failures
                 upper = float(np.mean(found.x0 + found.disturbances.sum(axis=1) > 0))
             seen.append((policy.steps, policy.history.failing_share[-1], upper))
         steps, failing, upper = np.array(seen, np.float64).T
         errors = [float(r.relative_error) for r, _ in runs]
-        yield (
-            f"{system}, {n} episodes, {method}",
-            summary(runs)
-            | {
-                "relative_errors": errors,
-                "relative_error_mean": float(np.mean(errors)),
-                "relative_error_spread": float(np.std(errors, ddof=1)) if seeds > 1 else None,
-                "failing_share": failing.tolist(),
-                "upper_mode": None if np.isnan(upper).all() else upper.tolist(),
-                "steps": float(np.mean(steps)),
-                "wall_s": [w for w, _ in clocks],
-                "cpu_s": float(np.median([c for _, c in clocks])),
-                "cpu_s_each": [c for _, c in clocks],
-            },
-        )
+        more = {
+            "relative_errors": errors,
+            "relative_error_mean": float(np.mean(errors)),
+            "relative_error_spread": float(np.std(errors, ddof=1)) if seeds > 1 else None,
+            "failing_share": failing.tolist(),
+            "upper_mode": None if np.isnan(upper).all() else upper.tolist(),
+            "steps": float(np.mean(steps)),
+            "wall_s": [w for w, _ in clocks],
+            "cpu_s": float(np.median([c for _, c in clocks])),
+            "cpu_s_each": [c for _, c in clocks],
+        }
+        yield f"{system}, {n} episodes, {method}", summary(runs) | more
 
 
 def default(seeds, peers, budget=100_000):
@@ -173,9 +154,8 @@ def ours(problems, budget, **settings):
     """The summary of `failure_probability` on (simulator, truth), a seed each."""
     cpu, runs = time.process_time(), []
     for seed, (sim, truth) in enumerate(problems):
-        runs.append(
-            (failure_probability(jax.random.key(10_000 + seed), sim, budget, **settings), truth)
-        )
+        key = jax.random.key(10_000 + seed)
+        runs.append((failure_probability(key, sim, budget, **settings), truth))
     return summary(runs) | {"cpu_s": (time.process_time() - cpu) / len(runs)}
 
 
@@ -228,11 +208,11 @@ def _chosen(args):
     """The fixed cases that are asked for."""
     if args.smoke:
         return cases(["four-branch"])
-    groups = dict(
-        fixed=cases, markov=markov_cases, literature=literature_cases, structural=structural_cases
-    )
-    wanted = args.cases or list(groups)
-    every = {group: make() for group, make in groups.items()}
+    every = dict(fixed=cases())
+    for group, rows in dict(markov=MARKOV, literature=LITERATURE).items():
+        every[group] = [Case(name, make(), truth) for name, (make, truth) in rows.items()]
+    every["structural"] = [Case(name, p.simulator(), p.truth) for name, p in PROBLEMS.items()]
+    wanted = args.cases or list(every)
     return [c for g, some in every.items() for c in some if g in wanted or c.name in wanted]
 
 

@@ -16,7 +16,7 @@ from benchmarks.limit_states import LIMITS
 from benchmarks.sizes import add_choices, options, percent, print_report, printer, size, timed
 from benchmarks.structural import PROBLEMS
 
-__all__ = ["METHODS", "run"]
+__all__ = ["METHODS", "Counted", "run"]
 
 # starts of FORM, one a mode, as a user who knows the modes would give them; levels that subset
 # simulation and NAIS take

@@ -15,10 +15,9 @@ import numpy as np
 from scipy import stats
 
 import jast
-from benchmarks.limit_states import Case
 from jast import distributions as D
 
-__all__ = ["PROBLEMS", "Problem", "structural_cases"]
+__all__ = ["PROBLEMS", "Problem"]
 
 POINTS = 200_001  # of a quadrature
 REACH = 9.0  # standard deviations to either side of it
@@ -350,9 +349,3 @@ PROBLEMS: dict[str, Problem] = {
         [normal(4), normal(2)], lambda x, np: x[0] - x[1], lambda p: stats.norm.sf(2**0.5)
     ),
 }
-
-
-def structural_cases(names=None):
-    """As `benchmarks.limit_states.cases`."""
-    some = PROBLEMS if names is None else names
-    return [Case(name, PROBLEMS[name].simulator(), PROBLEMS[name].truth) for name in some]

@@ -22,6 +22,7 @@ from jax.tree_util import Partial
 
 import jast
 from benchmarks.closed_loops import JUDGED, RARE, TUNED, system
+from benchmarks.reliability import Counted
 from benchmarks.sizes import add_choices, options, percent, print_report, printer, size
 from jast._src.normal_space.evaluate_points import evaluate_points
 from jast._src.normal_space.transform import dimension
@@ -162,22 +163,13 @@ def _subset(about, seed):
     """
     import openturns as ot
 
-    sim, d = about.simulator, dimension(about.simulator)
     ot.RandomGenerator.SetSeed(seed)
 
-    class Function(ot.OpenTURNSPythonFunction):
-        def __init__(self):
-            super().__init__(d, 1)
+    def distance(x):
+        o = evaluate_points(about.simulator, np.asarray(x, np.float32))
+        return np.where(o.failure, -1.0, np.maximum(o.distance, 1e-30))
 
-        def _exec_sample(self, x):
-            o = evaluate_points(sim, np.asarray(x, np.float32))
-            return np.where(o.failure, -1.0, np.maximum(o.distance, 1e-30)).reshape(-1, 1)
-
-    vector = ot.RandomVector(ot.Normal(d))
-    event = ot.ThresholdEvent(
-        ot.CompositeRandomVector(ot.Function(Function()), vector), ot.LessOrEqual(), 0.0
-    )
-    method = ot.SubsetSampling(event)
+    method = ot.SubsetSampling(Counted(distance, dimension(about.simulator)).event)
     method.setBlockSize(10_000)
     method.setMaximumOuterSampling(1)
     method.run()

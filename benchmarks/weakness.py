@@ -28,7 +28,7 @@ from sklearn.model_selection import KFold, cross_val_predict
 from sklearn.neighbors import KNeighborsClassifier
 from sklearn.neural_network import MLPClassifier
 
-from benchmarks.fms import mean
+from benchmarks.fms import mean, told
 from benchmarks.sizes import options, print_report, printer, size, timed
 from jast import plot, weakness
 from jast._src.weakness.measures import precision_recall
@@ -173,9 +173,8 @@ def table(result, failed, replacement):
         chance = rng.permutation(picked)
         rows.append([precision_recall(p, failed[rest]) for p in (picked, chance)])
     own, chance = np.nanmean(rows, axis=0)
-    return dict(
-        precision=own[0], recall=own[1], chance_precision=chance[0], chance_recall=chance[1]
-    )
+    of_chance = dict(chance_precision=chance[0], chance_recall=chance[1])
+    return dict(precision=own[0], recall=own[1]) | of_chance
 
 
 def tables(systems, seeds, out, say):
@@ -191,10 +190,8 @@ def tables(systems, seeds, out, say):
                 row = table(r, failed, replacement)
                 each.append(row | dict(all_precision=precision, calls=r.calls))
             rows = out[f"{name}, replacement={replacement}"] = over(each)
-            say(
-                f"  {name}, replacement={replacement}: "
-                + ", ".join(f"{k} {spread(v, 0 if k == 'calls' else 3)}" for k, v in rows.items()),
-            )
+            cells = (f"{k} {told(v, 0 if k == 'calls' else 3)}" for k, v in rows.items())
+            say(f"  {name}, replacement={replacement}: {', '.join(cells)}")
 
 
 def thesis(result, failed):
@@ -214,21 +211,14 @@ def thesis(result, failed):
     )
 
 
-def spread(v, digits=3):
-    if not isinstance(v, dict):
-        return f"{v:.{digits}f}"
-    error = "" if v["se"] is None else f" +- {v['se']:.{digits}f}"
-    return f"{v['mean']:.{digits}f}{error}"
-
-
 def line(name, row):
-    text = f"  {name:11} {'  '.join(f'{spread(f):>14}' for f in row['found'])}"
+    text = f"  {name:11} {'  '.join(f'{told(f):>14}' for f in row['found'])}"
     if "auc" in row:
-        text += f"  {spread(row['auc'], 4):>16} {spread(row['precision']):>15}"
+        text += f"  {told(row['auc'], 4):>16} {told(row['precision']):>15}"
     if "expected" in row:
         text += (
-            f"  expected left {spread(row['expected'], 1)}, true {spread(row['left'], 1)};"
-            f" {row['seconds_first']:.1f} s, then {spread(row['seconds'], 1)} s"
+            f"  expected left {told(row['expected'], 1)}, true {told(row['left'], 1)};"
+            f" {row['seconds_first']:.1f} s, then {told(row['seconds'], 1)} s"
         )
     return text
 
@@ -256,9 +246,9 @@ def study(images, labels, predicted, seeds, quick, picture, say):
         aucs = " ".join(f"{a['mean']:.3f}" for a in t["auc"])
         say(f"  thesis      AUC {aucs} (the last +- {t['auc'][-1]['se'] or 0:.3f})")
         digits = {name: 0 if name in ("candidates", "calls") else 3 for name in ROWS}
-        at_half = ", ".join(f"{name} {spread(t[name], digits[name])}" for name in ROWS)
+        at_half = ", ".join(f"{name} {told(t[name], digits[name])}" for name in ROWS)
         say(f"              at 0.5: {at_half}")
-        say(f"              {t['seconds_first']:.1f} s, then {spread(t['seconds'], 1)} s")
+        say(f"              {t['seconds_first']:.1f} s, then {told(t['seconds'], 1)} s")
     if picture:
         plot.failures_found(results, failed).figure.savefig(picture, dpi=150)
     return rows | {"inputs": len(labels), "failures": int(failed.sum())}
