@@ -2,9 +2,12 @@
 hang of one leaves the others alone.
 """
 
+import contextlib
+import os
 import pickle
 import pkgutil
 import re
+import tempfile
 import time
 import weakref
 from collections import deque
@@ -20,7 +23,7 @@ from jast._src.util.checks import import_library
 __all__ = ["Pool", "pack"]
 
 NEEDS = "jast.blackbox with workers >= 1"
-GRACE = 1.0  # seconds that a worker has beyond the time limits of its rows before it is killed
+GRACE = 1.0  # seconds that a worker has beyond the time limit of what it runs before it is killed
 START = 60.0  # seconds that a worker may take to start, and to load the system
 PIECE = 0.01  # seconds of work in a piece, at least, where that leaves no worker idle
 
@@ -81,7 +84,7 @@ class Worker:
     """One process, started on first use and started anew after its end."""
 
     def __init__(self, payload):
-        self.payload, self.executor = payload, None
+        self.payload, self.executor, self.at = payload, None, None
 
     def start(self):
         """A future that is done when the process has the system."""
@@ -90,10 +93,22 @@ class Worker:
             self.executor = loky.ProcessPoolExecutor(max_workers=1, timeout=None)
             return self.executor.submit(pickle.loads, self.payload)
 
+    def configure(self, x, size, timed):
+        """``timed``: it is to say when what it runs began, in a file that both map."""
+        if timed and self.at is None:
+            handle, name = tempfile.mkstemp(prefix="jast-")
+            os.close(handle)
+            self.at = np.memmap(name, np.float64, "w+", shape=2)
+        self.executor.submit(CONFIGURE, x, size, None if self.at is None else self.at.filename)
+
     def kill(self):
         executor, self.executor = self.executor, None
         if executor is not None:
             executor.shutdown(wait=False, kill_workers=True)
+        if self.at is not None:
+            name, self.at = self.at.filename, None
+            with contextlib.suppress(OSError):  # a system that lets no mapped file go
+                os.unlink(name)
 
 
 def _close(workers):
@@ -108,18 +123,22 @@ class _Piece(NamedTuple):
     queue: deque
     """Where the rows come from."""
     rows: np.ndarray
-    deadline: float
-    """When they must be done, by `time.monotonic`."""
+    given: float
+    """When it was given to the worker, by `time.monotonic`."""
+
+    def running(self):
+        """Which of the rows runs, None before the first, and when what runs of it began."""
+        began, row = (0.0, 0.0) if self.worker.at is None else self.worker.at
+        return (int(row), began) if began > self.given else (None, self.given)
 
 
 class Pool:
     """A `worker.Runner` whose rows are shared out over processes.
 
     Episodes go in pieces to whoever is free; the rows of a system of kept objects stay with their
-    worker. A worker that dies, or does not answer within its rows' time limits and `GRACE`, is
-    replaced; its rows then run one by one, and the one that does it again is the culprit. So a
-    system that hangs in code that nothing can interrupt costs each row its time limit and a start
-    of a process.
+    worker. A worker that dies is replaced; its rows then run one by one, and the one that does it
+    again is the culprit. So is one of which a part runs for longer than the time limit and `GRACE`;
+    it costs these and a start of a process, and the others of its piece run again.
     """
 
     def __init__(self, payload, workers, spec, x=0, size=0, system=None):
@@ -140,7 +159,7 @@ class Pool:
         self.x, self.size = x, size
         for w in self.workers:
             if w.executor is not None:
-                w.executor.submit(CONFIGURE, x, size)
+                w.configure(x, size, self.spec.limit)
 
     def probe(self, x0):
         """As `worker.Runner.probe`, in the first worker."""
@@ -189,13 +208,10 @@ class Pool:
                         w.kill()
                         self._start([w])
                         task = w.executor.submit(SERVE, t[rows], *leaves)
-                    busy[task] = _Piece(w, queue, rows, self._deadline(t[rows]))
+                    busy[task] = _Piece(w, queue, rows, time.monotonic())
                     free.remove(w)
-                first = min(piece.deadline for piece in busy.values())
-                patience = None if first == np.inf else max(0.0, first - time.monotonic())
-                done = wait(busy, patience, FIRST_COMPLETED).done
-                now = time.monotonic()
-                late = [task for task in set(busy) - done if now > busy[task].deadline]
+                done = wait(busy, self._patience(busy.values()), FIRST_COMPLETED).done
+                late = [task for task in set(busy) - done if not self._patience([busy[task]])]
                 for task in [*done, *late]:
                     piece = busy.pop(task)
                     free.add(piece.worker)
@@ -207,12 +223,16 @@ class Pool:
                             continue
                         except Exception as error:
                             problem = "died", _cause(error)
+                    culprit = piece.running()[0] if task in late else None
                     piece.worker.kill()
-                    if len(piece.rows) > 1:  # one by one, which finds the culprit
+                    if culprit is None and len(piece.rows) > 1:  # one by one, which finds it
                         piece.queue.extendleft(piece.rows[::-1, None])
-                    else:
-                        reply.terminal[piece.rows] = True
-                        reply.problems.append((int(piece.rows[0]), *problem))
+                        continue
+                    row = int(piece.rows[culprit or 0])
+                    reply.terminal[row] = True
+                    reply.problems.append((row, *problem))
+                    if len(piece.rows) > 1:
+                        piece.queue.appendleft(piece.rows[piece.rows != row])
         except BaseException:  # an interruption: what still runs must not answer the next call
             _close(self.workers)
             raise
@@ -232,21 +252,19 @@ class Pool:
         size = max(1, most, -(-n // (4 * count)) if count > 1 else 0)
         return [deque(rows[i : i + size] for i in range(0, n, size))] * count
 
-    def _deadline(self, t):
-        """When these rows must be done: each has its limit, and each transition of a history that
-        may have to be repeated.
-        """
+    def _patience(self, pieces):
+        """Seconds until what runs of one of the pieces must be done, at least 0; None: no limit."""
         if not self.spec.limit:
-            return np.inf
-        parts = len(t) if self.spec.episodic else np.sum(t + 2)
-        return time.monotonic() + float(parts) * self.spec.limit + GRACE
+            return None
+        first = min(piece.running()[1] for piece in pieces)
+        return max(0.0, first + self.spec.limit + GRACE - time.monotonic())
 
     def _start(self, workers):
         starting = [(w, task) for w in workers if (task := w.start()) is not None]
         try:
             for w, task in starting:
                 task.result(timeout=START)
-                w.executor.submit(CONFIGURE, self.x, self.size)
+                w.configure(self.x, self.size, self.spec.limit)
         except Exception as error:
             _close(self.workers)
             raise Unloadable(

@@ -131,18 +131,20 @@ class Runner:
         self.kept: dict[tuple, list] = {}  # history -> objects that have it
         self.count = 0  # of these
         self.spare: list = []  # objects for new episodes
-        self.configure(x, size)
         self.episodes = self.transitions = 0
         self.alarm = Alarm(spec.limit)
+        self.configure(x, size)
 
     def __reduce__(self):  # another process makes objects of its own
         return Runner, (self.system, self.spec, self.x, self.size)
 
-    def configure(self, x, size):
+    def configure(self, x, size, at=None):
         """``x``: the structure of a disturbance, like ``x0`` of `Spec`; ``size``: how many numbers
-        ``observe`` returns.
+        ``observe`` returns; ``at``: a file that is told where the work is, if anybody waits.
         """
         self.x, self.size = x, size
+        if at is not None:
+            self.alarm.at = np.memmap(at, np.float64, "r+")
 
     def probe(self, x0):
         """How many numbers ``observe`` returns, or a sentence (str) that says what is wrong with
@@ -183,6 +185,7 @@ class Runner:
         self.episodes = self.transitions = 0
         one = self._episode if self.spec.episodic else self._step
         for i in range(len(t)):
+            self.alarm.row = i
             try:
                 found = one(
                     int(t[i]), [np.array(a[i]) for a in x0], [np.array(a[i, : t[i]]) for a in xs]
@@ -331,14 +334,18 @@ class Runner:
 
 class Alarm(contextlib.AbstractContextManager):
     """Raises `TimedOut` in what runs for longer than ``seconds``, where signals exist and the code
-    can be interrupted; None: never.
+    can be interrupted; None: never. The file ``at``, if there is one, is told when what runs began,
+    and the row that it is of.
     """
 
     def __init__(self, seconds):
+        self.at, self.row = None, 0
         self.seconds = seconds if seconds is not None and hasattr(signal, "setitimer") else None
         self.on = self.rang = False
 
     def __enter__(self):
+        if self.at is not None:
+            self.at[:] = time.monotonic(), self.row
         if self.seconds is not None:
             signal.signal(signal.SIGALRM, self._ring)
             self.on, self.rang = True, False

@@ -128,14 +128,14 @@ class Asking:
         return self.function(self.host, *args)
 
 
-def hosts_of(sim) -> tuple[Any, ...]:
+def hosts_of(sim) -> Iterator[Any]:
     """The hosts that the functions of a simulator ask, each once; also those that a function asks
     which is bound by another one's arguments. The object keeps them.
     """
     kept = getattr(sim, "__dict__", {})
     if "_hosts" not in kept:
         kept["_hosts"] = tuple(_hosts_of(sim))
-    return kept["_hosts"]
+    return iter(kept["_hosts"])
 
 
 def _hosts_of(sim):
@@ -151,7 +151,7 @@ def _hosts_of(sim):
 
 def runs_on_host(sim):
     """Whether the simulator runs on the host: a black box, slow and without gradients."""
-    return bool(hosts_of(sim))
+    return any(True for _ in hosts_of(sim))
 
 
 def runs_made(sim):

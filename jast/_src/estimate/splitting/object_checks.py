@@ -19,7 +19,7 @@ def branching_objects(name: str, sim: Simulator) -> Any:
     """What saves and resumes the objects of a black box; None for a simulator in JAX. ValueError
     for a black box without objects in this process.
     """
-    host = next(iter(hosts_of(sim)), None)
+    host = next(hosts_of(sim), None)
     if host is None:
         return None
     if host.spec.episodic:
