@@ -4,7 +4,10 @@ or one search of a built-in system.
 
 import argparse
 import importlib.util
+import inspect
+import io
 import sys
+import tempfile
 from functools import partial
 from pathlib import Path
 
@@ -63,6 +66,9 @@ def main(argv=None):
     a_search = any(getattr(options, name) for name in SEARCH_OPTIONS)
     if options.method is None:
         options.method = "forest" if a_search and not options.system else "stress"
+    if options.system and options.simulator is not None:
+        parser.error("argument --simulator: of the built-in ones; there is a FILE.py:NAME, too")
+    options.simulator = options.simulator or "ferry"
     if options.system and options.method != "stress":
         parser.error("argument --method: a system of your own has stress, no other")
     if options.method == "stress" and a_search:
@@ -77,8 +83,12 @@ def main(argv=None):
             )
     try:
         options.output.mkdir(parents=True, exist_ok=True)
+        tempfile.TemporaryFile(dir=options.output).close()  # whether it takes files
     except OSError as e:
         parser.error(f"argument --output: {e}")
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):  # no name of a file ends what was found
+            stream.reconfigure(errors="replace")
     try:
         if not options.no_cache:
             _keep_programs()
@@ -110,7 +120,6 @@ def _parser():
     add(
         "--simulator",
         choices=SYSTEMS,
-        default="ferry",
         help="system under test (default: ferry; ferry-b is its easier variant S0b; colav avoids"
         " collisions with late sensors)",
     )
@@ -130,7 +139,7 @@ def _parser():
         ("--prunes", "roots of a tree of the forest (default: 18)"),
     ]:
         add(name, type=_count, metavar="N", help=text)
-    add("--seed", type=int, default=0, metavar="N", help="random seed (default: 0)")
+    add("--seed", type=_seed, default=0, metavar="N", help="random seed (default: 0)")
     add(
         "--output",
         type=Path,
@@ -170,11 +179,20 @@ def _count(text):
     return int(text)
 
 
+def _seed(text):
+    try:
+        jax.random.key(int(text))
+    except (OverflowError, ValueError):
+        message = f"must be a whole number of 32 bits, received {text!r}"
+        raise argparse.ArgumentTypeError(message) from None
+    return int(text)
+
+
 def _load(parser, place):
     """The simulator at FILE.py:NAME."""
     file, _, name = place.rpartition(":")
-    if not file and Path(name).is_file():
-        parser.error(f"argument FILE.py:NAME: name the simulator, too, as in {name}:sim")
+    if not file:
+        parser.error(f"argument FILE.py:NAME: name the simulator, too, as in {place}:sim")
     if not Path(file).is_file():
         parser.error(f"argument FILE.py:NAME: there is no file {file!r}")
     spec = importlib.util.spec_from_file_location(Path(file).stem, file)
@@ -183,6 +201,10 @@ def _load(parser, place):
     spec.loader.exec_module(module)
     found = getattr(module, name, None)
     if callable(found) and not isinstance(found, Simulator):
+        try:
+            inspect.signature(found).bind()
+        except TypeError as e:
+            parser.error(f"argument FILE.py:NAME: {name} must need no arguments: {e}")
         found = found()
     if not isinstance(found, Simulator):
         parser.error(f"argument FILE.py:NAME: {name} in {file} is no jast.Simulator: {found!r}")
@@ -195,13 +217,13 @@ def _stress(options, own):
     sim = SYSTEMS[name][0]() if own is None else own
     key = jax.random.key(options.seed)
     report = stress(key, sim, options.budget, progress=not options.quiet)
+    path = options.output / "report.npz"
+    save(path, report)  # before anything is printed: a pipe may be closed
     print(f"{name}, seed {options.seed}\n{report}\n", flush=True)
     best = report.failures.best
     if best is not None:
         best = replay(sim, best, reward=likelihood(sim))
         print(f"{_episode(best)}\n")
-    path = options.output / "report.npz"
-    save(path, report)
     print(f"saved {path}")
     _save_archive(options, report)
     page = options.output / "report.html"

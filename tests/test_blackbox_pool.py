@@ -100,6 +100,16 @@ def test_what_hangs_or_dies_costs_its_own_row_only():
     assert gone(pids)
 
 
+@pytest.mark.slow
+def test_a_hang_costs_one_time_limit_whatever_else_its_worker_was_given():
+    sim, first = box(blackboxes.troubled, workers=1), np.r_[10.0:70.0, 3, 10.0:70.0]
+    started = time.monotonic()
+    np.testing.assert_array_equal(ends(sim, first), np.where(first < 10, np.nan, first))
+    # 121 limits are 36 s
+    assert time.monotonic() - started < 20
+    assert [(i.kind, i.count) for i in incidents(sim)] == [("timed out", 1)]
+
+
 def test_workers_have_neither_jax_nor_this_package_and_share_the_rows():
     sim = box(blackboxes.modules, workers=1)
     np.testing.assert_array_equal(ends(sim, np.zeros(3)), 0)

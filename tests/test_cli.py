@@ -26,6 +26,17 @@ def cached(monkeypatch):
 
 
 @pytest.mark.slow
+def test_a_report_is_saved_before_it_is_printed(tmp_path, monkeypatch):
+    def closed(*args, **kwargs):
+        raise BrokenPipeError
+
+    monkeypatch.setattr(cli, "print", closed, raising=False)
+    with pytest.raises(BrokenPipeError):
+        cli.main(["--budget", "300", "--quiet", "--output", str(tmp_path)])
+    assert jast.load(tmp_path / "report.npz", jast.simulators.ferry()).tried
+
+
+@pytest.mark.slow
 def test_compiled_programs_are_kept_unless_told_otherwise(capsys, tmp_path, cached):
     run(capsys, tmp_path, "--method", "monte-carlo", "--no-cache")
     assert cached == []
@@ -187,7 +198,11 @@ def test_help(capsys):
             ["--prunes", "1.5"],
             "argument --prunes: must be a whole number of at least 1, received '1.5'",
         ),
-        (["--seed", "x"], "argument --seed: invalid int value: 'x'"),
+        (["--seed", "x"], "argument --seed: must be a whole number of 32 bits, received 'x'"),
+        (["--seed", str(2**70)], "argument --seed: must be a whole number of 32 bits"),
+        (["--simulator", "ferry", "mine.py:sim"], "argument --simulator: of the built-in ones"),
+        (["sim"], "argument FILE.py:NAME: name the simulator, too, as in sim:sim"),
+        ([f"{__file__}:run"], "argument FILE.py:NAME: run must need no arguments"),
         (
             ["--method", "mcts", "--prunes", "3"],
             "argument --prunes: only of --method forest, not of mcts",

@@ -4,6 +4,7 @@ What a call does may depend on what it finds, so each is asked with systems and 
 goes the same way each time; a way that is gone for the first time compiles its programs then.
 """
 
+import dataclasses
 import importlib
 import inspect
 from typing import NamedTuple
@@ -184,3 +185,16 @@ def test_a_second_key_compiles_nothing_and_another_budget_little(name, given):
     with compiled() as programs:
         call.run(first, call.other, given)
     assert len(programs) <= call.more
+
+
+@pytest.mark.slow
+def test_a_stress_of_few_evaluations_compiles_the_step_six_times(key, tmp_path):
+    """The check (two), batches of points, their episodes, one episode again, the derivative."""
+    named = jax.named_scope("of the user")(RARE.step)
+    sim = dataclasses.replace(RARE, step=lambda s, x: named(s, x))
+    jax.config.update("jax_dump_ir_to", str(tmp_path))
+    try:
+        jast.stress(key, sim, 5000)
+    finally:
+        jax.config.update("jax_dump_ir_to", None)
+    assert sum("of the user" in text.read_text() for text in tmp_path.iterdir()) == 6

@@ -33,7 +33,12 @@ class Program(NamedTuple):
         pipes = dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.PIPE)
         # a session of its own, so that what the program has started can be ended with it
         with subprocess.Popen(
-            self.command, **pipes, cwd=self.folder, text=True, start_new_session=True
+            self.command,
+            **pipes,
+            cwd=self.folder,
+            encoding="utf-8",
+            errors="replace",
+            start_new_session=True,
         ) as process:
             try:
                 out, errors = process.communicate(task)
@@ -85,10 +90,17 @@ def program(command: str | Sequence[str], *, folder: PathLike | None = None) -> 
         >>> bool(jast.rollout(jax.random.key(0), sim).distance >= 0.0)
         True
     """
-    parts = tuple(shlex.split(command) if isinstance(command, str) else map(os.fspath, command))
-    if not parts:
-        raise ValueError(f"program: command must name a program, received {command!r}")
-    if folder is not None and not os.path.isdir(folder):
+    try:
+        given = shlex.split(command) if isinstance(command, str) else map(os.fspath, command)
+        parts = tuple(map(os.fsdecode, given))
+    except (TypeError, ValueError):
+        parts = ()
+    if not parts or "\0" in "".join(parts):
+        raise ValueError(
+            "program: command must name a program, as a text that a shell could split or a sequence"
+            f" of texts, received {command!r}"
+        )
+    if folder is not None and not (isinstance(folder, str | os.PathLike) and os.path.isdir(folder)):
         raise ValueError(f"program: folder must be a directory, received {folder!r}")
     # a relative path with a folder in it is looked up from where the program runs
     near = folder is not None and os.path.dirname(parts[0])

@@ -16,6 +16,7 @@ from jast import distributions as D
 from jast._src.core.typing import Array, ArrayTree, DistributionLike, Numeric, PRNGKey
 from jast._src.distributions.normal_tails import normal_score
 from jast._src.runtime._jax import is_traced
+from jast._src.util.checks import check_numbers
 
 __all__ = [
     "Quantiles",
@@ -337,7 +338,7 @@ def wide(width: Numeric | None = None) -> Wide:
             the one at which most fail, and where none fails at all the one that comes nearest.
 
     Raises:
-        ValueError: for a width that is not above 0.
+        ValueError: for a width that is not above 0 and finite.
 
     Example:
         >>> import jax, jax.numpy as jnp, jast
@@ -347,8 +348,11 @@ def wide(width: Numeric | None = None) -> Wide:
         >>> bool(2.5 < jnp.std(x) < 3.5)
         True
     """
-    if width is not None and not is_traced(width) and not width > 0:
-        raise ValueError(f"actions.wide: width must be above 0, received {width!r}")
+    if width is not None:
+        check_numbers("actions.wide", width=width)
+        if not is_traced(width) and not 0 < width < np.inf:
+            wrong = "above 0" if not width > 0 else "finite"
+            raise ValueError(f"actions.wide: width must be {wrong}, received {width!r}")
     return Wide(width)
 
 
@@ -360,7 +364,8 @@ def uniform(low: ArrayTree, high: ArrayTree) -> UniformBox:
             x is one.
 
     Raises:
-        ValueError: where ``low`` is above ``high``, unless they are traced.
+        ValueError: for what is no number, and where ``low`` is above ``high``, unless they are
+            traced.
 
     Example:
         >>> import jax, jast
@@ -369,6 +374,9 @@ def uniform(low: ArrayTree, high: ArrayTree) -> UniformBox:
         >>> -3.0 <= float(x) <= 3.0
         True
     """
+    for name, end in (("low", low), ("high", high)):
+        for leaf in jax.tree.leaves(end):
+            check_numbers("actions.uniform", **{name: leaf})
     if not is_traced(low, high):
         _ordered(low, high)
     return UniformBox(low, high)

@@ -106,6 +106,9 @@ def rollout(
     Returns:
         `Episode`.
 
+    Raises:
+        ValueError: for what is no key, simulator, policy or reward.
+
     Example:
         >>> import jax, jast
         >>> episode = jast.rollout(jax.random.key(0), jast.simulators.walk1d())
@@ -114,6 +117,8 @@ def rollout(
     """
     check_random_key("rollout", key)
     require_simulator("rollout", sim)
+    if policy is not None and not isinstance(policy, Policy):
+        raise ValueError(f"rollout: policy must be a jast.Policy, received {policy!r:.80}")
     reward = rewards.as_pytree(reward)
     episode = _rollout(key, sim, policy, reward)
     if is_traced(episode):

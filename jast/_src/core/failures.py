@@ -228,6 +228,10 @@ def collect(
         >>> len(found), int(found.seen) == int(many.failure.sum())
         (3, True)
     """
+    if not isinstance(episodes, Episode):
+        raise ValueError(
+            f"collect: episodes must be a batch of jast.Episode, received {type(episodes).__name__}"
+        )
     episodes = jax.device_get(episodes._replace(states=None))
     m = np.shape(episodes.length)[0] if np.ndim(episodes.length) == 1 else None
     if m is None or any(np.shape(leaf)[:1] != (m,) for leaf in jax.tree.leaves(episodes)):
@@ -323,6 +327,8 @@ def save(path: PathLike, failures: Failures, settings: dict[str, Any] | None = N
         >>> with tempfile.TemporaryDirectory() as folder:
         ...     jast.failures.save(os.path.join(folder, "failures.npz"), found)
     """
+    if not isinstance(failures, Failures):
+        raise ValueError(f"save: failures must be an archive, received {type(failures).__name__}")
     save_load.store(path, failures, settings=settings or {})
 
 

@@ -34,7 +34,7 @@ from jast._src.util.checks import check_random_key, whole_number
 from jast._src.util.intervals import clopper_pearson
 from jast._src.util.pytrees import with_rows_of, zero_where
 
-__all__ = ["BRIEF", "Nominal", "nominal", "outcome"]
+__all__ = ["BRIEF", "Nominal", "describe_undisturbed", "nominal", "outcome"]
 
 BRIEF = 4096
 """Episodes up to which the program is compiled quickly, as it runs briefly: on the ferry and three
@@ -85,10 +85,7 @@ class Nominal(NamedTuple):
     def __str__(self) -> str:
         quiet = "not defined: a disturbance has neither a mode nor a median"
         if self.undisturbed is not None:
-            quiet = (
-                f"{'FAILS' if self.undisturbed.failure else 'no failure'}, distance"
-                f" {self.undisturbed.distance:.4g}, {self.undisturbed.length} steps"
-            )
+            quiet = describe_undisturbed(self.undisturbed)
         low, high = self.interval
         rows = [
             ("undisturbed", quiet),
@@ -100,6 +97,14 @@ class Nominal(NamedTuple):
         if "interrupted" in self.settings:
             rows.append(("interrupted", self.settings["interrupted"]))
         return "\n".join(f"{name:<14} {text}" for name, text in rows)
+
+
+def describe_undisturbed(e: Episode) -> str:
+    """What the undisturbed episode came to."""
+    outcome = "FAILS" if bool(e.failure) else "no failure"
+    if not np.isfinite(e.reward):
+        outcome = "INVALID: a number is not finite"
+    return f"{outcome}, distance {float(e.distance):.4g}, {int(e.length)} steps"
 
 
 def nominal(

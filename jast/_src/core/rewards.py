@@ -33,6 +33,7 @@ from jast._src.core.signature import signature_of
 from jast._src.core.simulator import Simulator
 from jast._src.core.typing import Density, Numeric, Reward
 from jast._src.runtime._jax import is_traced
+from jast._src.util.checks import check_numbers
 
 __all__ = [
     "Episodic",
@@ -204,6 +205,7 @@ def standard(event_bonus: Numeric = 0.0, density: Density = "raw") -> Standard:
         >>> float(jast.rewards.standard()(-1.0, False, 3.0, True))
         -4.0
     """
+    check_numbers("rewards.standard", event_bonus=event_bonus)
     return Standard(event_bonus, _checked("standard", density))
 
 
@@ -229,6 +231,7 @@ def episodic(
         >>> float(jast.rewards.episodic(bonus=10.0)(-1.0, True, -2.0, True))
         19.0
     """
+    check_numbers("rewards.episodic", bonus=bonus)
     if mode not in ("default", "thesis"):
         raise ValueError(f'rewards.episodic: mode must be "default" or "thesis", received {mode!r}')
     if mode == "thesis":
@@ -259,6 +262,7 @@ def shaped(scale: Numeric, event_bonus: Numeric = 0.0, density: Density = "raw")
         >>> float(jast.rewards.shaped(2.0)(-1.0, False, 3.0, False, 0.5))
         0.0
     """
+    check_numbers("rewards.shaped", scale=scale, event_bonus=event_bonus)
     return Shaped(scale, event_bonus, _checked("shaped", density))
 
 
@@ -301,7 +305,10 @@ def lexicographic(
         (0.5, -0.5)
     """
     for name, value in (("near", near), ("rare", rare)):
-        if value is not None and not is_traced(value) and not value > 0:
+        if value is None:
+            continue
+        check_numbers("rewards.lexicographic", **{name: value})
+        if not is_traced(value) and not value > 0:
             raise ValueError(f"rewards.lexicographic: {name} must be above 0, received {value!r}")
     if density is not None:
         _checked("lexicographic", density)
@@ -361,13 +368,20 @@ def as_pytree(reward: Reward) -> Reward:
     Args:
         reward: any reward.
 
+    Raises:
+        ValueError: for what cannot be called.
+
     Example:
         >>> import jax, jast
         >>> reward = jast.rewards.as_pytree(lambda log_p, event, d, terminal, approach: log_p)
         >>> jax.tree.leaves(reward)
         []
     """
-    return Partial(reward) if jax.tree_util.all_leaves([reward]) and callable(reward) else reward
+    if not callable(reward):
+        raise ValueError(
+            f"reward must be one of jast.rewards, or a function like these, received {reward!r:.80}"
+        )
+    return Partial(reward) if jax.tree_util.all_leaves([reward]) else reward
 
 
 def _checked(name, density):

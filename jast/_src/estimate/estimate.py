@@ -232,10 +232,12 @@ def flag_imprecise(found: Estimate) -> Estimate:
     if not (found.reliable and found.relative_error > MAX_RELATIVE_ERROR):
         return found
     enough = found.episodes * (found.relative_error / MAX_RELATIVE_ERROR) ** 2
+    digit = 10 ** (math.floor(math.log10(enough)) - 1)
+    enough = digit * math.ceil(enough / digit)  # rounded up: not what was spent already
     text = (
-        f"{IMPRECISE} {found.relative_error:.2g}, above {MAX_RELATIVE_ERROR}: the"
+        f"{IMPRECISE} {found.relative_error:.3g}, above {MAX_RELATIVE_ERROR}: the"
         " interval is too wide for an answer, and it takes at least"
-        f" {enough:.1g} evaluations to narrow it to that"
+        f" {enough:.2g} evaluations to narrow it to that"
     )
     return found._replace(reliable=False, warnings=(text, *found.warnings))
 

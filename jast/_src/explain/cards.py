@@ -57,7 +57,13 @@ def cards(
     checks.check_random_key(name, key)
     budget = checks.whole_number(name, "budget", budget, 1)
     p: Any = getattr(modes, "probability", None)
-    chosen: list[Any] = list(getattr(modes, "modes", modes))[:MODES]
+    chosen: Any = getattr(modes, "modes", modes)
+    if not isinstance(chosen, Sequence) or not all(isinstance(m, Mode) for m in chosen):
+        raise ValueError(
+            f"{name}: modes must be a report of jast.stress, or what jast.search.modes returned,"
+            f" received {type(modes).__name__}"
+        )
+    chosen = list(chosen)[:MODES]
     # tilts are told by playing their draws again
     again = runs_on_host(sim) and isinstance(getattr(p and p.draws, "source", None), Tilts)
     out: list[list[Minimal | Criticality | Eigenfailures]] = []

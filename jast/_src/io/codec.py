@@ -119,6 +119,8 @@ def encode(value: Any, arrays: dict[str, np.ndarray], at: str = "result") -> Any
         return {type(value).__name__: [below(v, i) for i, v in enumerate(value)]}
     if type(value) is dict and all(isinstance(k, str) for k in value):
         return {"dict": {k: below(v, k) for k, v in value.items()}}
+    if type(value) is dict:
+        raise ValueError(f"save: the keys of {at} must be texts, received {list(value)!r:.80}")
     names, children = _children_of(value)
     if children is None:
         raise ValueError(f"save: {at} must be an array, a number or a text, received {value!r}")

@@ -17,6 +17,7 @@ from jast._src.core.episode import Episode, replay
 from jast._src.core.signature import signature_of
 from jast._src.core.simulator import Simulator
 from jast._src.core.typing import PathLike
+from jast._src.util.checks import check_path
 from jast._src.util.leaf_names import path_name
 
 __all__ = ["by_step", "from_json", "to_csv", "to_numpy"]
@@ -96,6 +97,7 @@ def to_csv(path: PathLike, failures: Any) -> None:
         ...         print(file.readline().strip())
         failure,step,x
     """
+    check_path("to_csv", path)
     columns = by_step(failures)
     with open(path, "w", newline="", encoding="utf-8") as file:
         table = csv.writer(file)
@@ -142,9 +144,10 @@ def from_json(path: PathLike, sim: Simulator) -> Episode:
         True
     """
     try:
+        check_path("from_json", path)
         given = json.loads(Path(path).read_text(encoding="utf-8"))
         parts = [{a["name"]: a for a in given[name]} for name in ("x0", "disturbances")]
-    except (json.JSONDecodeError, KeyError, TypeError) as wrong:
+    except (json.JSONDecodeError, UnicodeDecodeError, KeyError, TypeError) as wrong:
         raise ValueError(
             f"from_json: path must be a file from the page of a report, received {str(path)!r},"
             f" which is not one: {wrong!r}"
@@ -159,6 +162,11 @@ def from_json(path: PathLike, sim: Simulator) -> Episode:
                 f" {sorted(part)}, received one with {sorted(names)}"
             )
         arrays = [np.array(part[name]["values"], part[name]["dtype"]) for name in names]
+        if name == "x":  # of no step there is no shape
+            arrays = [
+                a if len(a) else np.zeros((0, *shape.shape), a.dtype)
+                for a, (_, shape) in zip(arrays, pairs, strict=True)
+            ]
         wholes.append(treedef.unflatten(arrays))
     x0, x = wholes
     return replay(sim, x, x0)

@@ -20,6 +20,7 @@ import numpy as np
 
 from jast._src.core.typing import PathLike
 from jast._src.io.atomic import replacing
+from jast._src.util.checks import check_path
 
 __all__ = ["pack", "read", "unpack", "write"]
 
@@ -64,6 +65,7 @@ def read(path: PathLike, formats: Mapping[str, int], kind: str) -> tuple[Header,
     ValueError says why a file is refused: not ``kind``, which is of one of these ``formats``;
     another version than that of its format; or damaged.
     """
+    check_path("load", path)
     if os.path.isdir(path):
         raise ValueError(f"load: {path} is not {kind} but a folder, such as checkpoint= makes")
     with open(path, "rb") as file:

@@ -14,6 +14,7 @@ import numpy as np
 from jast._src.core.typing import PathLike
 from jast._src.io import former_files, npz
 from jast._src.io.codec import Given, check_episodes, decode, encode, place_of
+from jast._src.util.checks import check_path
 
 __all__ = [
     "check_kind",
@@ -89,6 +90,7 @@ def load(path: PathLike, sim: Any = None, *, heads: Any = None) -> Any:
 
 def store(path: Any, value: Any, **beside: Any) -> None:
     """Write ``value``, and what is ``beside`` it, which `load` leaves out."""
+    check_path("save", path)
     npz.write(path, FORMAT, VERSION, *parts(value, **beside))
 
 

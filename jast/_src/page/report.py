@@ -13,6 +13,7 @@ from jast._src.core.simulator import Simulator
 from jast._src.page.document import document, plain, rows, table, text, write
 from jast._src.page.episode_data import exact, groups, pictures, short, states_of, trace
 from jast._src.stress_testing import report_words
+from jast._src.util.checks import check_path
 
 __all__ = ["write_report"]
 
@@ -58,6 +59,14 @@ def write_report(
         draw: one state -> an SVG or HTML fragment.
         explanations: of the modes, in their order.
     """
+    check_path("Report.html", path)
+    if draw is not None and not callable(draw):
+        raise ValueError(f"Report.html: draw must be a function of a state, received {draw!r:.80}")
+    if isinstance(explanations, str) or not isinstance(explanations, Sequence):
+        raise ValueError(
+            "Report.html: explanations must be a sequence, of one for each mode, received"
+            f" {type(explanations).__name__}"
+        )
     if draw is not None and sim is None:
         raise ValueError(
             "Report.html: draw needs the simulator, which a report from a file does not hold:"

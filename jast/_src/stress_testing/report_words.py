@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from jast._src.core.nominal import describe_undisturbed
 from jast._src.estimate.estimate import guaranteed_words, is_doubtful
 from jast._src.runtime.host_errors import incidents
 
@@ -166,8 +167,7 @@ def verdict_rows(r: Any) -> list[tuple[str, str]]:
     quiet = r.nominal.undisturbed
     undisturbed = "not defined: a disturbance has neither a mode nor a median"
     if quiet is not None:
-        outcome = "FAILS" if bool(quiet.failure) else "no failure"
-        undisturbed = f"{outcome}, distance {float(quiet.distance):.4g}, {int(quiet.length)} steps"
+        undisturbed = describe_undisturbed(quiet)
     plain = f"{r.nominal.failing} of {r.nominal.episodes} fail"
     rows = [("undisturbed", undisturbed), ("plain draws", plain)]
     rows += _probability_rows(r.probability)

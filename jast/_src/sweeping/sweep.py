@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable, Iterable, Mapping, Sequence, Set
 from typing import Any
 
@@ -115,6 +116,8 @@ def sweep(
             "sweep: follow must be False with an executor, since its rows do not wait for each"
             " other"
         )
+    if callable(simulators):
+        _check_arguments("simulators", simulators, (), settings_of[0])
     n = len(settings_of)
     made = make_simulators(_checked(simulators, n), settings_of)
     keys = [jax.random.fold_in(key, i) for i in range(n)]
@@ -125,6 +128,8 @@ def sweep(
         terminable(),
     ):
         own = options_of(function, options, None if executor else checkpoint, n)
+        near = dict(near=None) if follow else {}
+        _check_arguments("function", function, (key, None), {**own[0], **near})
         rows = Rows(function, keys, made, own, store is not None)
         if executor is None:
             found, ended = run_here(rows, follow, store, watch), ""
@@ -154,6 +159,21 @@ def sweep(
     )
 
 
+def _check_arguments(name, called, args, named):
+    """ValueError where the signature of what is ``called`` does not take these arguments."""
+    try:
+        signature = inspect.signature(called)
+    except (TypeError, ValueError):  # one that says nothing of itself
+        return
+    try:
+        signature.bind(*args, **named)
+    except TypeError as error:
+        what = ", ".join([*("key, simulator" for _ in args[:1]), *map(repr, named)])
+        raise ValueError(
+            f"sweep: {name} must take {what}, received {_name(called)}: {error}"
+        ) from error
+
+
 def _join(function, rows, found):
     """The `Curve` of the rows that are done, where they are one kind of cheap systems."""
     if function is not failure_probability or count_kinds(rows.made) > 1:
@@ -173,6 +193,8 @@ def _rows(values):
         )
     columns = {}
     for name, given in values.items():
+        if not isinstance(name, str):
+            raise ValueError(f"sweep: names of values must be texts, received {name!r}")
         single = isinstance(given, str | Mapping | Set) or not hasattr(given, "__len__")
         if single or getattr(given, "ndim", 1) == 0:
             raise ValueError(f"sweep: {name} must be a sequence of values, received {given!r}")

@@ -4,6 +4,7 @@ expected and what came.
 
 import importlib
 import operator
+import os
 from typing import Any
 
 import jax
@@ -12,7 +13,15 @@ import numpy as np
 
 from jast._src.runtime._jax import is_traced
 
-__all__ = ["import_library", "number", "check_random_key", "real_number", "whole_number"]
+__all__ = [
+    "check_numbers",
+    "check_path",
+    "check_random_key",
+    "import_library",
+    "number",
+    "real_number",
+    "whole_number",
+]
 
 
 def import_library(function: str, module: str, extra: str) -> Any:
@@ -35,6 +44,21 @@ def check_random_key(function: str, key: Any) -> None:
         raise ValueError(
             f"{function}: key must be a jax.random.key{hint}, received {received[:80]}"
         )
+
+
+def check_numbers(function: str, **named: Any) -> None:
+    """ValueError unless these are numbers, arrays of them or traced, and none is NaN."""
+    for name, value in named.items():
+        if not is_traced(value):
+            array = np.asarray(value)
+            if array.dtype.kind not in "iuf" or np.isnan(array).any():
+                raise ValueError(f"{function}: {name} must be a number, received {value!r}")
+
+
+def check_path(function: str, path: Any) -> None:
+    """ValueError unless ``path`` is a place of a file."""
+    if not isinstance(path, str | os.PathLike):
+        raise ValueError(f"{function}: path must be that of a file, received {path!r:.80}")
 
 
 def whole_number(function, name, value, least=1, bits=None):

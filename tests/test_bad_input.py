@@ -1,0 +1,79 @@
+"""What no function can use is refused with a ValueError that names the argument and what came."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jast
+from jast.simulators import walk1d
+
+SIM = walk1d()
+
+
+def made(gain):
+    return SIM
+
+
+def swept(values, *args, **options):
+    return lambda key: jast.sweep(key, made, values, *args, **options)
+
+
+@pytest.mark.parametrize(
+    "call, words",
+    [
+        (lambda key: jast.rollout(key, SIM, policy=3), "policy must be a jast.Policy, received 3"),
+        (lambda key: jast.rollout(key, SIM, reward=3), "reward must be one of .*, received 3"),
+        (lambda key: jast.replay(SIM, jnp.ones(3), reward=3), "reward must be .*, received 3"),
+        (lambda key: jast.search.mcts(key, SIM, reward=3), "reward must be .*, received 3"),
+        (lambda key: jast.rewards.standard("a"), "event_bonus must be a number, received 'a'"),
+        (lambda key: jast.rewards.standard(np.nan), "event_bonus must be a number, received nan"),
+        (lambda key: jast.rewards.episodic("a"), "bonus must be a number, received 'a'"),
+        (lambda key: jast.rewards.shaped(None), "scale must be a number, received None"),
+        (lambda key: jast.rewards.lexicographic("a", 1), "near must be a number, received 'a'"),
+        (lambda key: jast.actions.wide("a"), "width must be a number, received 'a'"),
+        (lambda key: jast.actions.wide(np.inf), "width must be finite, received inf"),
+        (lambda key: jast.actions.uniform("a", 1.0), "low must be a number, received 'a'"),
+        (lambda key: jast.actions.uniform(0.0, np.nan), "high must be a number, received nan"),
+        (swept({"zz": [1, 2]}), "simulators must take 'zz', received made: missing"),
+        (swept({3: [1, 2]}), "names of values must be texts, received 3"),
+        (swept({"gain": [1]}, len), "function must take key, simulator, received len"),
+        (swept({"gain": [1]}, jast.nominal, follow=True), "must take key, simulator, 'near'"),
+        (swept({"gain": [1]}, jast.nominal, budgets=3), "must take key, simulator, 'budgets'"),
+        (lambda key: jast.blackbox.program(None), "command must name a program, .*, received None"),
+        (lambda key: jast.blackbox.program(["ls", 3]), "command must name a program, as a text"),
+        (lambda key: jast.blackbox.program("ls 'a"), "command must name a program, as a text"),
+        (
+            lambda key: jast.blackbox.program(["ls", "a\0"]),
+            "command must name a program, as a text",
+        ),
+        (lambda key: jast.blackbox.program("ls", folder=3.5), "folder must be a directory"),
+        (lambda key: jast.load(None), "load: path must be that of a file, received None"),
+        (lambda key: jast.save(None, 3), "save: path must be that of a file, received None"),
+        (
+            lambda key: jast.save("unused.npz", {1: 2}),
+            "keys of result must be texts",
+        ),
+        (lambda key: jast.failures.to_csv(None, None), "to_csv: path must be"),
+        (lambda key: jast.failures.from_json(None, SIM), "from_json: path must be"),
+        (lambda key: jast.failures.save("unused.npz", None), "failures must be an archive"),
+        (
+            lambda key: jast.failures.collect(SIM, jast.rewards.standard(), None),
+            "episodes must be a batch of jast.Episode, received NoneType",
+        ),
+        (lambda key: jast.explain.cards(key, SIM, None), "modes must be .*, received NoneType"),
+        (lambda key: jast.explain.cards(key, SIM, [3]), "modes must be .*, received list"),
+    ],
+)
+def test_it_is_named(key, tmp_path, monkeypatch, call, words):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ValueError, match=words):
+        call(key)
+    assert not list(tmp_path.iterdir())
+
+
+def test_arrays_and_traced_numbers_are_numbers():
+    assert jast.rewards.standard(jnp.arange(3.0)).event_bonus.shape == (3,)
+    paid = jax.jit(lambda b: jast.rewards.standard(b)(-1.0, True, 0.0, True))(2.0)
+    assert float(paid) == 1.0
+    assert float(jax.jit(lambda w: jast.actions.wide(w).width)(3.0)) == 3.0
