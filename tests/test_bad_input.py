@@ -61,6 +61,10 @@ def swept(values, *args, **options):
             lambda key: jast.failures.collect(SIM, jast.rewards.standard(), None),
             "episodes must be a batch of jast.Episode, received NoneType",
         ),
+        (
+            lambda key: jast.explain.minimal(walk1d(horizon=5), jast.rollout(key, SIM)),
+            "minimal: disturbances of episode",
+        ),
         (lambda key: jast.explain.cards(key, SIM, None), "modes must be .*, received NoneType"),
         (lambda key: jast.explain.cards(key, SIM, [3]), "modes must be .*, received list"),
     ],

@@ -139,6 +139,21 @@ def test_check_says_where_failures_on_the_way_are_lost():
         assert jast.check(box(system, 8, episodic=True)).episodic
 
 
+class Continued(blackboxes.Walk):
+    """Its ``initialize`` does not bring it back to its start."""
+
+    def initialize(self, *x0):
+        if not hasattr(self, "s"):
+            super().initialize(*x0)
+
+
+@pytest.mark.parametrize("episodic", [None, True])
+def test_check_says_where_an_object_does_not_start_anew(episodic):
+    with pytest.raises(ValueError, match="initialize brings an object back to its start"):
+        jast.check(box(Continued, 5, episodic=episodic))
+    assert jast.check(box(blackboxes.Walk, 5, episodic=episodic))
+
+
 def test_what_is_observed_may_be_chosen_from_more():
     sim = jast.check(box(Looks, 3, observe=lambda s: s.seen[5:7]))
     assert sim.observe(sim.step(sim.init(()), jnp.ones(()))).tolist() == [6, 7]

@@ -14,6 +14,7 @@ import threading
 import time
 import traceback
 import types
+from collections import deque
 from typing import NamedTuple
 
 import numpy as np
@@ -130,7 +131,7 @@ class Runner:
         self.system, self.spec = system, spec
         self.kept: dict[tuple, list] = {}  # history -> objects that have it
         self.count = 0  # of these
-        self.spare: list = []  # objects for new episodes
+        self.spare: deque = deque()  # objects for new episodes, the longest unused first
         self.episodes = self.transitions = 0
         self.alarm = Alarm(spec.limit)
         self.configure(x, size)
@@ -319,7 +320,7 @@ class Runner:
         return (fill(self.spec.x0, x0),) if self.spec.random else ()
 
     def _fresh(self):
-        return self.spare.pop() if self.spare else self.system()
+        return self.spare.popleft() if self.spare else self.system()
 
     def _take(self, history):
         things = self.kept.get(history)

@@ -12,7 +12,7 @@ from jast._src.normal_space import transform
 from jast._src.normal_space.evaluate_points import PointEvaluator
 from jast._src.normal_space.mode_coordinates import centred
 from jast._src.util.leaf_names import entry_places, leaf_name
-from jast._src.util.pytrees import count_numbers
+from jast._src.util.pytrees import conform, count_numbers
 
 __all__ = [
     "EpisodePoint",
@@ -58,6 +58,9 @@ def failing_point(
             f" {np.shape(episode.failure)}: choose one of them"
         )
     transform.check(name, sim)
+    like = signature_of(sim)
+    rows = jax.tree.map(lambda s: jax.ShapeDtypeStruct((sim.horizon, *s.shape), s.dtype), like.x)
+    conform(f"{name}: disturbances of episode", episode.disturbances, rows)
     of_modes = centred(sim)
     one = jax.tree.map(lambda a: np.asarray(a)[None], episode._replace(states=None))
     recorded = transform.normal_of(of_modes, one)[0].astype(np.float64)
