@@ -110,6 +110,35 @@ def test_a_hang_costs_one_time_limit_whatever_else_its_worker_was_given():
     assert [(i.kind, i.count) for i in incidents(sim)] == [("timed out", 1)]
 
 
+def slow_or_not(disturbances):
+    """The number of its process; the first numbers say how long that takes."""
+    blackboxes.time.sleep(0.2 * (disturbances[0] > 0))
+    return blackboxes.process(disturbances)
+
+
+def test_without_a_time_limit_nobody_is_late():
+    sim = box(slow_or_not, time_limit=None)
+    before = set(ends(sim, np.zeros(8)))
+    pids = ends(sim, np.tile([0.0, 1.0], 8))
+    assert np.isfinite(pids).all() and set(pids) <= before | set(processes(sim))
+    assert set(processes(sim)) >= set(pids) and incidents(sim) == ()
+
+
+class Built(blackboxes.Walk):
+    """Takes three time limits and more to be made."""
+
+    def __init__(self):
+        time.sleep(1.6)
+
+
+@pytest.mark.slow
+def test_what_an_object_takes_to_be_made_is_no_run():
+    sim = box(Built, horizon=2)
+    keys = jax.random.split(jax.random.key(0), 4)
+    many = jax.vmap(jast.rollout, (0, None))(keys, sim)
+    assert np.isfinite(many.distance).all() and incidents(sim) == ()
+
+
 def test_workers_have_neither_jax_nor_this_package_and_share_the_rows():
     sim = box(blackboxes.modules, workers=1)
     np.testing.assert_array_equal(ends(sim, np.zeros(3)), 0)

@@ -95,20 +95,26 @@ class Worker:
 
     def configure(self, x, size, timed):
         """``timed``: it is to say when what it runs began, in a file that both map."""
-        if timed and self.at is None:
-            handle, name = tempfile.mkstemp(prefix="jast-")
-            os.close(handle)
-            self.at = np.memmap(name, np.float64, "w+", shape=2)
-        self.executor.submit(CONFIGURE, x, size, None if self.at is None else self.at.filename)
+        if not timed or self.at is not None:
+            self.executor.submit(CONFIGURE, x, size)
+            return
+        handle, name = tempfile.mkstemp(prefix="jast-")
+        os.close(handle)
+        self.at = np.memmap(name, np.float64, "w+", shape=2)
+        self.executor.submit(CONFIGURE, x, size, name).result(timeout=START)
+        self._forget_file()  # both have mapped it
 
     def kill(self):
         executor, self.executor = self.executor, None
         if executor is not None:
             executor.shutdown(wait=False, kill_workers=True)
         if self.at is not None:
-            name, self.at = self.at.filename, None
-            with contextlib.suppress(OSError):  # a system that lets no mapped file go
-                os.unlink(name)
+            self._forget_file()
+            self.at = None
+
+    def _forget_file(self):
+        with contextlib.suppress(OSError):  # Windows lets no mapped file go, until its end
+            os.unlink(self.at.filename)
 
 
 def _close(workers):
@@ -211,7 +217,11 @@ class Pool:
                     busy[task] = _Piece(w, queue, rows, time.monotonic())
                     free.remove(w)
                 done = wait(busy, self._patience(busy.values()), FIRST_COMPLETED).done
-                late = [task for task in set(busy) - done if not self._patience([busy[task]])]
+                late = {}  # task -> the row that runs too long
+                for task in set(busy) - done:
+                    row, began = busy[task].running()
+                    if self.spec.limit and time.monotonic() > began + self.spec.limit + GRACE:
+                        late[task] = row
                 for task in [*done, *late]:
                     piece = busy.pop(task)
                     free.add(piece.worker)
@@ -223,7 +233,7 @@ class Pool:
                             continue
                         except Exception as error:
                             problem = "died", _cause(error)
-                    culprit = piece.running()[0] if task in late else None
+                    culprit = late.get(task)
                     piece.worker.kill()
                     if culprit is None and len(piece.rows) > 1:  # one by one, which finds it
                         piece.queue.extendleft(piece.rows[::-1, None])

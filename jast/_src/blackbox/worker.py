@@ -123,6 +123,9 @@ def takes(function, count):
     return True
 
 
+MAKING = 60.0  # seconds that the making of an object may take, whatever the time limit of its runs
+
+
 class Runner:
     """A system and the objects that it has made."""
 
@@ -320,7 +323,10 @@ class Runner:
         return (fill(self.spec.x0, x0),) if self.spec.random else ()
 
     def _fresh(self):
-        return self.spare.popleft() if self.spare else self.system()
+        if self.spare:
+            return self.spare.popleft()
+        self.alarm.tell(MAKING)
+        return self.system()
 
     def _take(self, history):
         things = self.kept.get(history)
@@ -344,9 +350,13 @@ class Alarm(contextlib.AbstractContextManager):
         self.seconds = seconds if seconds is not None and hasattr(signal, "setitimer") else None
         self.on = self.rang = False
 
-    def __enter__(self):
+    def tell(self, later=0.0):
+        """What runs now may take its time limit from then on."""
         if self.at is not None:
-            self.at[:] = time.monotonic(), self.row
+            self.at[:] = time.monotonic() + later, self.row
+
+    def __enter__(self):
+        self.tell()
         if self.seconds is not None:
             signal.signal(signal.SIGALRM, self._ring)
             self.on, self.rang = True, False

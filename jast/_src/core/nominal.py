@@ -70,7 +70,7 @@ class Nominal(NamedTuple):
     """
     first: int | None = None
     """Number of the first episode that failed, which ``rollout(jax.random.fold_in(key, first),
-    sim)`` plays again; None where none did.
+    sim)`` plays again; None where none did, and of a `jast.stress`, whose failures are its own.
     """
     settings: Mapping[str, Any] = {}
     """``method``, ``seed``, the ``episodes`` asked for, and ``interrupted`` where not all were
@@ -102,8 +102,8 @@ class Nominal(NamedTuple):
 def describe_undisturbed(e: Episode) -> str:
     """What the undisturbed episode came to."""
     outcome = "FAILS" if bool(e.failure) else "no failure"
-    if not np.isfinite(e.reward):
-        outcome = "INVALID: a number is not finite"
+    if not np.isfinite(e.distance):
+        outcome = "INVALID: its distance is not finite"
     return f"{outcome}, distance {float(e.distance):.4g}, {int(e.length)} steps"
 
 

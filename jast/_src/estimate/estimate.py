@@ -232,8 +232,9 @@ def flag_imprecise(found: Estimate) -> Estimate:
     if not (found.reliable and found.relative_error > MAX_RELATIVE_ERROR):
         return found
     enough = found.episodes * (found.relative_error / MAX_RELATIVE_ERROR) ** 2
-    digit = 10 ** (math.floor(math.log10(enough)) - 1)
-    enough = digit * math.ceil(enough / digit)  # rounded up: not what was spent already
+    if math.isfinite(enough):  # rounded up: not what was spent already
+        digit = 10 ** (math.floor(math.log10(enough)) - 1)
+        enough = digit * math.ceil(enough / digit)
     text = (
         f"{IMPRECISE} {found.relative_error:.3g}, above {MAX_RELATIVE_ERROR}: the"
         " interval is too wide for an answer, and it takes at least"

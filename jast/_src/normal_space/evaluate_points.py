@@ -67,7 +67,7 @@ def evaluate_points(sim: Simulator, z: np.ndarray) -> transform.Outcomes:
     """
     if runs_on_host(sim):
         return answer_once(lambda z: _together(sim, jnp.asarray(z)), z)
-    return _outcomes(_by_program(_program(), sim, z))
+    return _by_program(_program(), sim, z, _outcomes)
 
 
 def evaluate_distances(sim: Simulator, z: np.ndarray) -> tuple[transform.Outcomes, np.ndarray]:
@@ -82,7 +82,7 @@ def evaluate_on_device(sim: Simulator, z: jax.Array, n: int) -> transform.Outcom
     by the program of `evaluate_points`.
     """
     play = _program()
-    return _outcomes(answer_once(lambda z: _in_blocks(play, sim, z, np.int32(n)), z, rows=n))
+    return answer_once(lambda z: _outcomes(_in_blocks(play, sim, z, np.int32(n))), z, rows=n)
 
 
 def _program():
@@ -96,14 +96,16 @@ def _outcomes(found):
     return found if isinstance(found, transform.Outcomes) else found[0]
 
 
-def _by_program(play, sim, z):
+def _by_program(play, sim, z, part=lambda found: found):
+    """What ``play`` says of the points, or the ``part`` of it that is asked for."""
     n, d = z.shape
     lanes, out = lanes_of(d), []
     if n <= LANES:
         lanes = min(lanes, LANES)  # on an accelerator a few points are not filled up with many
     for i in range(0, n, lanes):
-        part = z[i : i + lanes]
-        out.append(answer_once(partial(_padded, play, sim, lanes), part, rows=len(part)))
+        points = z[i : i + lanes]
+        ask = partial(_padded, play, sim, lanes, part)
+        out.append(answer_once(ask, points, rows=len(points)))
     return out[0] if len(out) == 1 else jax.tree.map(lambda *a: np.concatenate(a), *out)
 
 
@@ -113,11 +115,11 @@ def _together(sim, z, distances=False):
     return jax.vmap(partial(play, sim))(z)
 
 
-def _padded(play, sim, lanes, z):
-    """What ``play`` says [lanes], of which the first ones are of ``z`` [n, D]."""
+def _padded(play, sim, lanes, part, z):
+    """``part`` of what ``play`` says [lanes], of which the first ones are of ``z`` [n, D]."""
     filled = np.zeros((lanes, z.shape[1]), z.dtype)
     filled[: len(z)] = z
-    return _in_blocks(play, sim, filled, np.int32(len(z)))
+    return part(_in_blocks(play, sim, filled, np.int32(len(z))))
 
 
 def lanes_of(d: int) -> int:

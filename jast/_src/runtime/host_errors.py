@@ -133,7 +133,7 @@ def hosts_of(sim) -> Iterator[Any]:
     """The hosts that the functions of a simulator ask, each once; also those that a function asks
     which is bound by another one's arguments. The object keeps them.
     """
-    kept = getattr(sim, "__dict__", {})
+    kept = vars(sim) if isinstance(sim, Simulator) else {}
     if "_hosts" not in kept:
         kept["_hosts"] = tuple(_hosts_of(sim))
     return iter(kept["_hosts"])

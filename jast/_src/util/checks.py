@@ -51,7 +51,8 @@ def check_numbers(function: str, **named: Any) -> None:
     for name, value in named.items():
         if not is_traced(value):
             array = np.asarray(value)
-            if array.dtype.kind not in "iuf" or np.isnan(array).any():
+            real = any(jnp.issubdtype(array.dtype, kind) for kind in (jnp.integer, jnp.floating))
+            if not real or np.isnan(array).any():
                 raise ValueError(f"{function}: {name} must be a number, received {value!r}")
 
 
