@@ -132,11 +132,6 @@ class _Piece(NamedTuple):
     given: float
     """When it was given to the worker, by `time.monotonic`."""
 
-    def running(self):
-        """Which of the rows runs, None before the first, and when what runs of it began."""
-        began, row = (0.0, 0.0) if self.worker.at is None else self.worker.at
-        return (int(row), began) if began > self.given else (None, self.given)
-
 
 class Pool:
     """A `worker.Runner` whose rows are shared out over processes.
@@ -216,11 +211,13 @@ class Pool:
                         task = w.executor.submit(SERVE, t[rows], *leaves)
                     busy[task] = _Piece(w, queue, rows, time.monotonic())
                     free.remove(w)
-                done = wait(busy, self._patience(busy.values()), FIRST_COMPLETED).done
+                first = min(self._running(piece)[1] for piece in busy.values())
+                patience = None if first == np.inf else max(0.0, first - time.monotonic())
+                done = wait(busy, patience, FIRST_COMPLETED).done
                 late = {}  # task -> the row that runs too long
                 for task in set(busy) - done:
-                    row, began = busy[task].running()
-                    if self.spec.limit and time.monotonic() > began + self.spec.limit + GRACE:
+                    row, due = self._running(busy[task])
+                    if time.monotonic() > due:
                         late[task] = row
                 for task in [*done, *late]:
                     piece = busy.pop(task)
@@ -262,12 +259,13 @@ class Pool:
         size = max(1, most, -(-n // (4 * count)) if count > 1 else 0)
         return [deque(rows[i : i + size] for i in range(0, n, size))] * count
 
-    def _patience(self, pieces):
-        """Seconds until what runs of one of the pieces must be done, at least 0; None: no limit."""
-        if not self.spec.limit:
-            return None
-        first = min(piece.running()[1] for piece in pieces)
-        return max(0.0, first + self.spec.limit + GRACE - time.monotonic())
+    def _running(self, piece):
+        """Which of its rows runs, None before the first, and when what runs of it must be done."""
+        row, began = None, piece.given
+        if piece.worker.at is not None and piece.worker.at[0] > began:
+            began, row = piece.worker.at.tolist()
+            row = int(row)
+        return row, began + (self.spec.limit or np.inf) + GRACE
 
     def _start(self, workers):
         starting = [(w, task) for w in workers if (task := w.start()) is not None]

@@ -83,12 +83,9 @@ class Nominal(NamedTuple):
         return display.renamed(self, "failures", "failing")
 
     def __str__(self) -> str:
-        quiet = "not defined: a disturbance has neither a mode nor a median"
-        if self.undisturbed is not None:
-            quiet = describe_undisturbed(self.undisturbed)
         low, high = self.interval
         rows = [
-            ("undisturbed", quiet),
+            ("undisturbed", describe_undisturbed(self.undisturbed)),
             ("failures", f"{self.failing} of {self.episodes} episodes"),
             ("rate", f"{self.rate:.4g}   95 % [{low:.4g}, {high:.4g}]"),
             ("mean distance", f"{self.mean_distance:.4g}"),
@@ -99,8 +96,10 @@ class Nominal(NamedTuple):
         return "\n".join(f"{name:<14} {text}" for name, text in rows)
 
 
-def describe_undisturbed(e: Episode) -> str:
-    """What the undisturbed episode came to."""
+def describe_undisturbed(e: Episode | None) -> str:
+    """What the undisturbed episode came to, or why there is none."""
+    if e is None:
+        return "not defined: a disturbance has neither a mode nor a median"
     outcome = "FAILS" if bool(e.failure) else "no failure"
     if not np.isfinite(e.distance):
         outcome = "INVALID: its distance is not finite"

@@ -164,11 +164,8 @@ def work_rows(r: Any) -> list[tuple[str, int, int, int, float]]:
 
 def verdict_rows(r: Any) -> list[tuple[str, str]]:
     """Rows of a name and a text; a row without a name goes on with the one before."""
-    quiet = r.nominal.undisturbed
-    undisturbed = "not defined: a disturbance has neither a mode nor a median"
-    if quiet is not None:
-        undisturbed = describe_undisturbed(quiet)
     plain = f"{r.nominal.failing} of {r.nominal.episodes} fail"
+    undisturbed = describe_undisturbed(r.nominal.undisturbed)
     rows = [("undisturbed", undisturbed), ("plain draws", plain)]
     rows += _probability_rows(r.probability)
     text = "no failure was found"

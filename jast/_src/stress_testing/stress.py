@@ -329,11 +329,9 @@ class _StressTest:
                 self.nominal, found = nominal_points(key, self.sim, episodes)
             else:
                 self.nominal = nominal(key, self.sim, episodes)
-                first = self.nominal.first
-                played = (
-                    [] if first is None else [rollout(jax.random.fold_in(key, first), self.sim)]
-                )
-                found = stacked(played) if played else empty(self.sim).episodes
+                found, first = empty(self.sim).episodes, self.nominal.first
+                if first is not None:
+                    found = stacked([rollout(jax.random.fold_in(key, first), self.sim)])
         n = self.nominal
         if n.undisturbed is not None and bool(n.undisturbed.failure):
             self.pool = self.collect([n.undisturbed])

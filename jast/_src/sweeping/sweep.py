@@ -129,7 +129,7 @@ def sweep(
     ):
         own = options_of(function, options, None if executor else checkpoint, n)
         near = dict(near=None) if follow else {}
-        _check_arguments("function", function, (key, None), {**own[0], **near})
+        _check_arguments("function", function, ("key", "simulator"), {**own[0], **near})
         rows = Rows(function, keys, made, own, store is not None)
         if executor is None:
             found, ended = run_here(rows, follow, store, watch), ""
@@ -160,7 +160,9 @@ def sweep(
 
 
 def _check_arguments(name, called, args, named):
-    """ValueError where the signature of what is ``called`` does not take these arguments."""
+    """ValueError where the signature of what is ``called`` does not take these arguments, of which
+    ``args`` has the names.
+    """
     try:
         signature = inspect.signature(called)
     except (TypeError, ValueError):  # one that says nothing of itself
@@ -168,7 +170,7 @@ def _check_arguments(name, called, args, named):
     try:
         signature.bind(*args, **named)
     except TypeError as error:
-        what = ", ".join([*("key, simulator" for _ in args[:1]), *map(repr, named)])
+        what = ", ".join([*args, *map(repr, named)])
         raise ValueError(
             f"sweep: {name} must take {what}, received {_name(called)}: {error}"
         ) from error
