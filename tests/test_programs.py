@@ -189,12 +189,20 @@ def test_a_second_key_compiles_nothing_and_another_budget_little(name, given):
 
 @pytest.mark.slow
 def test_a_stress_of_few_evaluations_compiles_the_step_six_times(key, tmp_path):
-    """The check (two), batches of points, their episodes, one episode again, the derivative."""
-    named = jax.named_scope("of the user")(RARE.step)
-    sim = dataclasses.replace(RARE, step=lambda s, x: named(s, x))
+    """The check (two), batches of points, their episodes, one episode again, the derivative. It is
+    traced five times: for all of them, for its contract, for its size, and twice to be compared.
+    """
+    named, traced = jax.named_scope("of the user")(RARE.step), []
+
+    def step(s, x):
+        traced.append(s)
+        return named(s, x)
+
+    sim = dataclasses.replace(RARE, step=step)
     jax.config.update("jax_dump_ir_to", str(tmp_path))
     try:
         jast.stress(key, sim, 5000)
     finally:
         jax.config.update("jax_dump_ir_to", None)
     assert sum("of the user" in text.read_text() for text in tmp_path.iterdir()) == 6
+    assert len(traced) == 5

@@ -21,7 +21,12 @@ from jast import distributions as D
 from jast._src.core.actions import Quantiles, Samples, UniformBox, Wide
 from jast._src.core.lost_failures import warn_of_lost_failures
 from jast._src.core.signature import signature_of
-from jast._src.core.simulator import Simulator, require_simulator
+from jast._src.core.simulator import (
+    Simulator,
+    first_state,
+    next_state,
+    require_simulator,
+)
 from jast._src.core.traps import traps
 from jast._src.core.typing import Actions, Array, ArrayTree
 from jast._src.runtime._jax import is_traced, is_tracing, quick
@@ -146,10 +151,10 @@ def contract(function, sim, actions=None, observed=0):
         if not callable(getattr(sim, name)):
             raise ValueError(f"{name}: expected a function, received {getattr(sim, name)!r}")
     release()  # here, as whatever compiles much for a simulator comes by first
-    kept, asked = vars(sim).setdefault("_contracts", set()), (jax.config.jax_enable_x64, observed)
-    if actions is not None or asked not in kept:
+    kept, wide = vars(sim).setdefault("_contracts", set()), jax.config.jax_enable_x64
+    if actions is not None or (wide, observed) not in kept:
         jax.eval_shape(lambda: _trace(function, sim, actions, observed))
-        kept.add(asked)
+        kept |= {(wide, observed), (wide, 0)}  # who looks at no observation asks for less
     return sim
 
 
@@ -350,7 +355,7 @@ def _probe(sim, actions):
             state, done = carry
             dist = sim.disturbance(state)
             x = choose(dist, t)
-            after = _arrays("step", sim.step(state, x))
+            after = next_state(sim, state, x)
             ends, flags = look(after)
             flags = (~jnp.isfinite(dist.log_prob(x)), *flags)
             flags = jax.tree.map(lambda f: f & ~done, flags)
@@ -358,7 +363,7 @@ def _probe(sim, actions):
 
         start = sim.start()
         x0 = choose(start, 0)
-        first = _arrays("init", sim.init(x0))
+        first = first_state(sim, x0)
         done, flags = look(first)
         steps = sim.horizon if sim.episodic else min(sim.horizon, STEPS)
         begun = with_rows_of(undisturbed, (first, jnp.zeros((), bool)))
@@ -383,7 +388,7 @@ def _probe(sim, actions):
     if actions is not None:
 
         def impossible(key):
-            dist = sim.disturbance(_arrays("init", sim.init(x0)))
+            dist = sim.disturbance(first_state(sim, x0))
             return ~jnp.isfinite(dist.log_prob(actions.draw(key, dist)))
 
         drawn = jax.vmap(impossible)(jax.random.split(jax.random.key(1), DRAWS))

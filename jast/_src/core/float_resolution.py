@@ -19,11 +19,11 @@ from jast import distributions as D
 from jast._src.core.actions import Wide
 from jast._src.core.counter_prng import COUNTER
 from jast._src.core.signature import signature_of
-from jast._src.core.simulator import Simulator
+from jast._src.core.simulator import Simulator, first_state, next_state
 from jast._src.core.typing import Array
 from jast._src.runtime._jax import quick
 from jast._src.runtime.host_errors import runs_on_host
-from jast._src.util.pytrees import select, with_rows_of, with_strong_types
+from jast._src.util.pytrees import select, with_rows_of
 
 __all__ = ["Probe", "describe", "probe", "rounding_problem"]
 
@@ -171,7 +171,7 @@ def _five_paths(sim: Simulator, steps: int, keys: jax.Array) -> tuple[Any, ...]:
     key_of = partial(jax.random.wrap_key_data, impl=COUNTER)
     when = (seed % max(steps // 2, 1)).astype(jnp.int32)
     which = jnp.arange(5, dtype=jnp.int32)
-    state = sim.init(D.sample(sim.start(), key_of(keys[0])))
+    state = first_state(sim, D.sample(sim.start(), key_of(keys[0])))
     states = jax.tree.map(lambda a: jnp.broadcast_to(a, (5, *jnp.shape(a))), state)
     widens = signature_of(sim).disturbance.closed  # where that costs no more
 
@@ -181,7 +181,7 @@ def _five_paths(sim: Simulator, steps: int, keys: jax.Array) -> tuple[Any, ...]:
         dist = sim.disturbance(state)
         wide = Wide(jnp.where(i == 4, WIDTH, 1.0))
         x = wide.draw(key, dist) if widens else D.sample(dist, key)
-        after = sim.step(state, x)
+        after = next_state(sim, state, x)
         off = jax.tree.map(partial(_a_unit_off, seed + t.astype(seed.dtype)), after)
         return select(i == 2, off, after), x
 
@@ -229,8 +229,14 @@ def _five_paths(sim: Simulator, steps: int, keys: jax.Array) -> tuple[Any, ...]:
     first = with_rows_of(keys, first)
     last = lax.while_loop(lambda p: (p.t < steps) & ~jnp.any(p.done[:3]), body, first)
     distance = jax.vmap(evaluate)(last.states)[1] if sim.episodic else last.distance
-    leaves = jax.tree.leaves(with_strong_types(state))
-    return last.units, distance, last.unmoved, last.differ, last.course.back, leaves
+    return (
+        last.units,
+        distance,
+        last.unmoved,
+        last.differ,
+        last.course.back,
+        jax.tree.leaves(state),
+    )
 
 
 def _follow(

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jax import lax
 
 from jast import distributions as D
-from jast._src.core.simulator import Simulator
+from jast._src.core.simulator import Simulator, first_state, next_state
 from jast._src.runtime.host_errors import hosts_of
 from jast._src.util.pytrees import select
 
@@ -58,10 +58,10 @@ def _draw(key, sim):
 
         def step(state, t):
             x = choose(jax.random.fold_in(key, t), sim.disturbance(state))
-            return sim.step(state, x), x
+            return next_state(sim, state, x), x
 
         x0 = choose(key, sim.start())
-        return x0, lax.scan(step, sim.init(x0), jnp.arange(1, sim.horizon + 1))[1]
+        return x0, lax.scan(step, first_state(sim, x0), jnp.arange(1, sim.horizon + 1))[1]
 
     return jax.vmap(episode)(jax.random.split(key, EPISODES), jnp.arange(EPISODES) >= EPISODES // 2)
 

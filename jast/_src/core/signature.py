@@ -13,8 +13,7 @@ import jax
 import jax.numpy as jnp
 
 from jast import distributions as D
-from jast._src.core.simulator import Simulator
-from jast._src.util.pytrees import with_strong_types
+from jast._src.core.simulator import Simulator, first_state
 
 __all__ = ["Offer", "Signature", "ask", "per_simulator", "signature_of"]
 
@@ -142,7 +141,7 @@ class _Answer:
 def _first_state(sim: Simulator) -> tuple[Any, Any, Any, Any]:
     start = sim.start()
     x0 = D.sample(start, jax.random.key(0))
-    state = with_strong_types(sim.init(x0))
+    state = first_state(sim, x0)
     return start, x0, state, sim.disturbance(state)
 
 

@@ -13,10 +13,19 @@ from jax.tree_util import Partial
 from jast._src.core.typing import Disturbance, Evaluate, Init, IsTerminal, Observe, Start, Step
 from jast._src.distributions.containers import accepted
 from jast._src.util import display
-from jast._src.util.pytrees import as_partial, traceable
+from jast._src.util.pytrees import as_partial, traceable, with_strong_types
 from jast.distributions import Fixed
 
-__all__ = ["Simulator", "fixed", "never", "ravel", "require_simulator", "translating"]
+__all__ = [
+    "Simulator",
+    "first_state",
+    "fixed",
+    "never",
+    "next_state",
+    "ravel",
+    "require_simulator",
+    "translating",
+]
 
 
 def fixed():
@@ -141,6 +150,21 @@ class Simulator:
             raise ValueError(
                 f"Simulator: episodic must be True or False, received {self.episodic!r}"
             )
+
+
+# each is traced once, for all programs with the system in them
+
+
+@jax.jit
+def first_state(sim: Simulator, x0: Any) -> Any:
+    """The state that ``x0`` puts the system in."""
+    return with_strong_types(sim.init(x0))
+
+
+@jax.jit
+def next_state(sim: Simulator, state: Any, x: Any) -> Any:
+    """The state that disturbance ``x`` leads to."""
+    return with_strong_types(sim.step(state, x))
 
 
 def require_simulator(function: str, sim: Any) -> None:

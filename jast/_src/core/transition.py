@@ -13,9 +13,9 @@ import jax.numpy as jnp
 from jast import distributions as D
 from jast._src.core import rewards
 from jast._src.core.signature import signature_of
-from jast._src.core.simulator import Simulator
+from jast._src.core.simulator import Simulator, first_state, next_state
 from jast._src.core.typing import ArrayTree
-from jast._src.util.pytrees import select, with_strong_types, zero_where
+from jast._src.util.pytrees import select, zero_where
 
 __all__ = ["Progress", "advance", "begin", "blank", "conclude"]
 
@@ -65,7 +65,7 @@ def begin(sim: Simulator, reward: Callable, x0: Any, last: Any = False) -> Progr
 def _begin(sim: Simulator, reward: Callable, x0: Any, last: Any) -> Progress:
     """`begin`, of a ``reward`` that is a pytree."""
     start = sim.start()
-    state = with_strong_types(sim.init(x0))
+    state = first_state(sim, x0)
     before, last = blank(sim, state), jnp.asarray(last)
     log_p = _log_densities(start, x0, reward)
     return _arrive(sim, reward, before, state, log_p, last, jnp.zeros_like)
@@ -82,7 +82,7 @@ def advance(sim: Simulator, reward: Callable, progress: Progress, x: Any, last: 
 def _advance(sim: Simulator, reward: Callable, progress: Progress, x: Any, last: Any) -> Progress:
     """`advance`, of a ``reward`` that is a pytree."""
     dist = sim.disturbance(progress.state)
-    state = with_strong_types(sim.step(progress.state, x))
+    state = next_state(sim, progress.state, x)
     log_p = _log_densities(dist, x, reward)
 
     def approach(distance: jax.Array) -> jax.Array:

@@ -12,9 +12,9 @@ from jax.custom_derivatives import SymbolicZero
 from jast import distributions as D
 from jast._src.core.float_resolution import Probe, describe, probe
 from jast._src.core.signature import per_simulator, signature_of
-from jast._src.core.simulator import Simulator
+from jast._src.core.simulator import Simulator, first_state, next_state
 from jast._src.runtime.host_errors import runs_on_host
-from jast._src.util.pytrees import Key, with_strong_types
+from jast._src.util.pytrees import Key
 
 __all__ = ["traps"]
 
@@ -167,11 +167,9 @@ def _level(sim: Simulator) -> bool:
         for i, number in zip(smooth, floats, strict=True):
             numbers[i] = number
         x = jax.tree.unflatten(tree, numbers)
-        state = with_strong_types(sim.init(D.sample(sim.start(), jax.random.key(0))))
+        state = first_state(sim, D.sample(sim.start(), jax.random.key(0)))
         # a loop follows what needs several steps to reach the distance
-        state, _ = lax.scan(
-            lambda s, _: (with_strong_types(sim.step(s, x)), None), state, length=sim.horizon
-        )
+        state, _ = lax.scan(lambda s, _: (next_state(sim, s, x), None), state, length=sim.horizon)
         return heard(sim.evaluate(state)[1])
 
     floats = [leaves[i] for i in smooth]

@@ -19,7 +19,7 @@ from jast import distributions as D
 from jast._src.core import rewards
 from jast._src.core.episode import play_back
 from jast._src.core.policy import Policy
-from jast._src.core.simulator import Simulator
+from jast._src.core.simulator import Simulator, first_state, next_state
 from jast._src.core.typing import PRNGKey
 from jast._src.estimate import diagnostics
 from jast._src.estimate.estimate import Estimate
@@ -39,7 +39,7 @@ from jast._src.normal_space.transform import dimension, policy_of
 from jast._src.util import display
 from jast._src.util.checks import check_random_key, whole_number
 from jast._src.util.intervals import clopper_pearson, log_normal
-from jast._src.util.pytrees import as_partial, select, with_strong_types, zero_where
+from jast._src.util.pytrees import as_partial, select, zero_where
 
 __all__ = ["Event", "GivenStart", "events", "given_start"]
 
@@ -313,11 +313,11 @@ def _evaluate_block(sim, functions, proposal, made, length, of):
 
     def one(made, length):
         x0, choose = _disturbances(sim, proposal, made)
-        first = with_strong_types(sim.init(x0))
+        first = first_state(sim, x0)
 
         def step(state, t):
             x = choose(state, t)
-            after = select(t < length, with_strong_types(sim.step(state, x)), state)
+            after = select(t < length, next_state(sim, state, x), state)
             return after, zero_where(t >= length, x)
 
         last, xs = lax.scan(step, first, jnp.arange(sim.horizon, dtype=jnp.int32))
@@ -349,7 +349,7 @@ def _disturbances(sim, proposal, made):
 @partial(jax.jit, static_argnums=3)
 def _evaluate_starts(key, sim, functions, n):
     def one(key):
-        first = with_strong_types(sim.init(D.sample(sim.start(), key)))
+        first = first_state(sim, D.sample(sim.start(), key))
         return {k: jnp.asarray(f(first)) for k, f in functions.items()}
 
     return jax.vmap(one)(jax.random.split(key, n))

@@ -10,7 +10,12 @@ from jax.tree_util import Partial
 
 from jast import distributions as D
 from jast._src.core.signature import signature_of
-from jast._src.core.simulator import Simulator, require_simulator
+from jast._src.core.simulator import (
+    Simulator,
+    first_state,
+    next_state,
+    require_simulator,
+)
 from jast._src.core.typing import Array, PRNGKey
 from jast._src.stress_testing.report import Report
 from jast._src.util.pytrees import select, with_strong_types
@@ -136,14 +141,14 @@ def _arrived(sim, state, t):
 
 def _init(sim_a, sim_b, x0):
     t = jnp.zeros((), jnp.int32)
-    sides = (_arrived(sim, with_strong_types(sim.init(x0)), t) for sim in (sim_a, sim_b))
+    sides = (_arrived(sim, first_state(sim, x0), t) for sim in (sim_a, sim_b))
     (a, _), (b, distance) = sides
     return Both(a, b, with_strong_types(distance), t)
 
 
 def _moved(sim, side, x, t):
     """``side`` a step later: (`Side`, miss distance). One that is over stays where it is."""
-    state = select(side.over, side.state, with_strong_types(sim.step(side.state, x)))
+    state = select(side.over, side.state, next_state(sim, side.state, x))
     after, distance = _arrived(sim, state, t)
     return select(side.over, side, after), distance
 
@@ -175,7 +180,7 @@ def _evaluate(sim_b, state):
 
 def _quiet(sim):
     """The miss distance of the start at its mode."""
-    return jnp.abs(sim.evaluate(with_strong_types(sim.init(D.mode(sim.start()))))[1])
+    return jnp.abs(sim.evaluate(first_state(sim, D.mode(sim.start())))[1])
 
 
 def _observe(sim_a, sim_b, state):
