@@ -28,6 +28,7 @@ from jast._src.search.monte_carlo import monte_carlo
 from jast._src.search.result import table
 from jast._src.simulators.svg_states import DRAWN
 from jast._src.stress_testing.stress import DEFAULT_BUDGET
+from jast._src.util.pytrees import index_tree
 from jast.explain import cards
 from jast.stress_testing import stress
 
@@ -292,7 +293,7 @@ def _episode(episode):
     numbers = dict(reward=episode.reward, log_p=episode.log_prob, distance=episode.distance)
     said = ", ".join(f"{k.replace('_', ' ')} {float(v):.4f}" for k, v in numbers.items())
     lines = [f"{title}: {said}, {int(episode.length)} steps"]
-    x = jax.tree.map(lambda a: a[: int(episode.length)], episode.disturbances)
+    x = index_tree(episode.disturbances, np.s_[: int(episode.length)])
     style = dict(precision=4, max_line_width=120, suppress_small=True, threshold=300, prefix="    ")
     for path, a in jax.tree_util.tree_leaves_with_path({"x0": episode.x0, "x": x}):
         name = f"{path[0].key}{jax.tree_util.keystr(path[1:])}"

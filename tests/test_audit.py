@@ -18,6 +18,7 @@ from jast._src.estimate.proposal_search.audit import Missing, audit_proposal, un
 from jast._src.estimate.proposal_search.search_state import SearchState, add_batch, search_context
 from jast._src.estimate.proposal_search.settings import SETTINGS
 from jast._src.estimate.tilts.family import TiltFamily
+from jast._src.util.pytrees import index_tree
 from jast.estimate import failure_probability
 
 BUDGET = 500_000  # a batch is 20,000 episodes
@@ -130,7 +131,7 @@ def test_two_parts_that_are_missing_get_a_tilt_each(key):
         z = rng.standard_normal((200, 4, 3))
         z[:, :, mode] += 2.2
         failing, points = f.play_again(z.reshape(200, 12))
-        return f.select(points, failing)
+        return index_tree(points, failing)
 
     known, *lost = (failures(mode) for mode in range(3))
     q = f.fit(known, np.zeros(len(known.length)))

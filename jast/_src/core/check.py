@@ -32,7 +32,7 @@ from jast._src.core.typing import Actions, Array, ArrayTree
 from jast._src.runtime._jax import is_traced, is_tracing, quick
 from jast._src.runtime.host_errors import incidents, new_incidents, runs_on_host
 from jast._src.runtime.memory import release
-from jast._src.util.pytrees import select, with_rows_of
+from jast._src.util.pytrees import index_tree, select, with_rows_of
 
 __all__ = ["ACTIONS", "OBSERVED", "check", "contract"]
 
@@ -375,7 +375,7 @@ def _probe(sim, actions):
         )
         if sim.episodic:
             distance = distance.at[-1].set(~jnp.isfinite(sim.evaluate(last)[1]))
-        x = jax.tree.map(lambda a: a[0], xs)
+        x = index_tree(xs, 0)
         # a black box has kept what it says of the start
         judged = last if sim.episodic or runs_on_host(sim) else first
         return (density, nan, distance), (x0, x, judged)
@@ -383,7 +383,7 @@ def _probe(sim, actions):
     lanes = HOSTED_LANES if runs_on_host(sim) else LANES
     keys = jax.random.split(jax.random.key(0), lanes + 1)
     flags, values = jax.vmap(episode)(keys, jnp.arange(lanes + 1) == lanes)
-    x0, x, judged = jax.tree.map(lambda a: a[0], values)
+    x0, x, judged = index_tree(values, 0)
     share = None
     if actions is not None:
 

@@ -24,6 +24,7 @@ from jast._src.io import save_load
 from jast._src.io.data_frames import dataframe
 from jast._src.io.export import by_step, from_json, to_csv, to_numpy
 from jast._src.util import display
+from jast._src.util.pytrees import index_tree
 
 __all__ = [
     "Failures",
@@ -81,7 +82,7 @@ class Failures:
 
     def take(self, rows: slice | np.ndarray) -> Failures:
         """The archive of these ``rows``, a slice or rising numbers."""
-        return Failures(*_take(self.rows(), rows), seen=self.seen, dropped=self.dropped)
+        return Failures(*index_tree(self.rows(), rows), seen=self.seen, dropped=self.dropped)
 
     def rows(self) -> tuple[Any, ...]:
         """What has a row for each episode."""
@@ -143,7 +144,7 @@ class Failures:
             raise IndexError(
                 f"Failures.episode: i must be within the {self.size} episodes held, received {i}"
             )
-        return _take(self.episodes, i)
+        return index_tree(self.episodes, i)
 
     def __str__(self) -> str:
         found = f"{int(self.seen)} failing episode{'s' * (self.seen != 1)} simulated"
@@ -245,7 +246,7 @@ def collect(
     replays, rows, kept = {}, [], []
     failing = np.flatnonzero(episodes.failure)
     for i in failing:
-        candidate = _take(episodes, i)
+        candidate = index_tree(episodes, i)
         name = identity(candidate)
         if name not in replays:
             again = jax.device_get(replay(sim, candidate, reward=reward)._replace(states=None))
@@ -358,10 +359,6 @@ def load(path: PathLike, sim: Simulator | None = None) -> tuple[Failures, dict[s
     return failures, beside.get("settings", {})
 
 
-def _take(episodes, i):
-    return jax.tree.map(lambda a: a[i], episodes)
-
-
 def _numbers(name, values, m):
     values = np.asarray(values)
     if values.shape != (m,):
@@ -391,7 +388,7 @@ def _best(caller, failures, top):
     order = np.lexsort((failures.tree, failures.simulation, -failures.episodes.reward))
     groups = {}
     for i in order:
-        groups.setdefault(identity(_take(failures.episodes, i)), []).append(i)
+        groups.setdefault(identity(index_tree(failures.episodes, i)), []).append(i)
     groups = list(groups.values())[:top]
     best = np.array([group[0] for group in groups], np.int64)
     first = np.array(

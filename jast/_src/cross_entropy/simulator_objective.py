@@ -27,6 +27,7 @@ from jast._src.cross_entropy.gaussian import Gaussian, normal
 from jast._src.cross_entropy.result import CEResult
 from jast._src.distributions.flat_rows import filled
 from jast._src.normal_space.sequences import latent_policy
+from jast._src.util.pytrees import index_tree
 
 __all__ = ["Stress", "over"]
 
@@ -87,7 +88,7 @@ class Stress:
             return failures.empty(self.sim)
         episodes = jax.device_get(_episodes(self.sim, self.reward, self.actions, jnp.asarray(rows)))
         failing = known[episodes.failure[known] & np.isfinite(episodes.reward[known])]
-        kept = jax.tree.map(lambda a: a[failing], episodes)
+        kept = index_tree(episodes, failing)
         return failures.collect(
             self.sim, self.reward, kept, failing // x.shape[-2], failing % x.shape[-2], top=top
         )

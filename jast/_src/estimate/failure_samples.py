@@ -29,6 +29,7 @@ from jast._src.runtime.checkpoints import answer_once, keep_answers, open_checkp
 from jast._src.runtime.memory import require_episodes
 from jast._src.util import display
 from jast._src.util.checks import check_random_key, whole_number
+from jast._src.util.pytrees import index_tree
 
 __all__ = ["FailureSamples", "failure_samples"]
 
@@ -166,7 +167,7 @@ def _draw_failures(name, key, sim, q, samples, moves):
     episodes = answer_once(partial(transform.episodes, sim), moved.z)
     # numbers that decided nothing are no part of an episode; and rounding differs between compiled
     # programs, so an episode on the edge of failure may not fail again
-    episodes = jax.tree.map(lambda a: a[episodes.failure], episodes)
+    episodes = index_tree(episodes, episodes.failure)
     return FailureSamples(
         failures=episodes,
         ess=effective_sample_size(log_w),

@@ -20,6 +20,7 @@ from jast._src.estimate.tilts.tilts import Tilts, shape, simulate_points
 from jast._src.normal_space.evaluate_points import evaluate_points
 from jast._src.normal_space.pcn import WIDTHS, proposed
 from jast._src.normal_space.transform import dimension, normal_numbers
+from jast._src.util.pytrees import index_tree
 
 __all__ = [
     "FINAL_MOVES",
@@ -96,10 +97,6 @@ class Population(NamedTuple):
     """[n] int32: how many of the numbers decided the episode"""
     invalid: np.ndarray
     """[n] bool"""
-
-    def take(self, rows):
-        """The `Population` of ``rows``."""
-        return Population(*(a[rows] for a in self))
 
 
 class PopulationSampler:
@@ -207,13 +204,13 @@ def explore(key, sim, size, *, covered=None, min_log_probability=-math.inf, max_
         log_mean += math.log(np.mean(score <= level))
         elites = np.flatnonzero(score <= level)
         # each elite as often as any other, or once more
-        population = population.take(elites[(np.arange(size) + len(levels)) % len(elites)])
+        population = index_tree(population, elites[(np.arange(size) + len(levels)) % len(elites)])
         if level == -math.inf:
             failures = sampler.move(population, level, 1.0, FINAL_MOVES)
             return sampler.result(failures, log_mean, levels)
         population = sampler.move(population, level, 1.0, 1)
         levels.append(level)
-    found = sampler.result(population.take(slice(0)), -math.inf, levels)
+    found = sampler.result(index_tree(population, slice(0)), -math.inf, levels)
     return found._replace(complete=complete)
 
 
@@ -241,7 +238,7 @@ def draw_wide_failures(key, sim, n, *, covered=None):
         failing = np.flatnonzero(population.score == -np.inf)
         if len(failing) >= FAILING_SHARE * len(population.z):
             break
-    return population.take(failing), width, sampler
+    return index_tree(population, failing), width, sampler
 
 
 def draw_wide(rng, sim, n, log_mean, *, moves=0, covered=None):
@@ -261,7 +258,7 @@ def draw_wide(rng, sim, n, log_mean, *, moves=0, covered=None):
     population = sampler.draw(width)
     for _ in range(moves):
         population = sampler.move(population, population.score, width, 1)
-    return population.take(population.score == -np.inf), width
+    return index_tree(population, population.score == -np.inf), width
 
 
 def bracket_boundary(key, sim, n):
@@ -291,8 +288,10 @@ def cool(key, sim, size, *, covered=None, design_points=None, zeroing_rounds=0):
     if not len(failures.z):
         return sampler.result(failures, -math.inf, (width,))
     if design_points is not None and len(design_points):
-        failures = failures.take(np.argsort(explained(failures.z, design_points), kind="stable"))
-    failures = failures.take(np.arange(size) % len(failures.z))
+        failures = index_tree(
+            failures, np.argsort(explained(failures.z, design_points), kind="stable")
+        )
+    failures = index_tree(failures, np.arange(size) % len(failures.z))
     widths = np.geomspace(width, FINAL_WIDTH, COOLING_STEPS)
     for width in widths:
         failures = sampler.move(failures, -math.inf, width, 1)

@@ -41,6 +41,7 @@ from jast._src.util import display
 from jast._src.util.checks import check_random_key, whole_number
 from jast._src.util.display import call_settings
 from jast._src.util.intervals import checked_level
+from jast._src.util.pytrees import index_tree
 
 __all__ = [
     "Traces",
@@ -226,7 +227,7 @@ def chunks(simulate, shared, lanes, watch, placement=work.HERE, plain=None):
 
     def fold(kept, i, rows):
         total, done = kept
-        rows = jax.tree.map(lambda a: a[: samples - i * lanes], rows)
+        rows = index_tree(rows, np.s_[: samples - i * lanes])
         own = None if plain is None else plain(i)[: len(rows.failure)]
         return weight_sums.add_traces(total, rows, own), done + len(rows.failure)
 
@@ -311,7 +312,7 @@ def choose_component(key, proposal):
     for_component, for_start, for_steps = jax.random.split(key, 3)
     one = len(proposal.log_weights) == 1
     k = 0 if one else jax.random.categorical(for_component, proposal.log_weights)
-    return jax.tree.map(lambda a: a[k], proposal.policies), for_start, for_steps
+    return index_tree(proposal.policies, k), for_start, for_steps
 
 
 @partial(jit, static_argnames="n")
@@ -323,9 +324,9 @@ def draw_episodes(key, sim, proposal, n):
     def one(key):
         for_component, for_episode = jax.random.split(key)
         k = jax.random.categorical(for_component, proposal.log_weights)
-        own = jax.tree.map(lambda a: a[k], proposal.policies)
+        own = index_tree(proposal.policies, k)
         e = rollout(for_episode, sim, own, log_likelihood)
-        states = jax.tree.map(lambda a: a[:-1], e.states)
+        states = index_tree(e.states, np.s_[:-1])
         t = jnp.arange(sim.horizon, dtype=jnp.int32)
 
         def log_q(policy):

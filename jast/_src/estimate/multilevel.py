@@ -28,6 +28,7 @@ from jast._src.runtime._jax import jit
 from jast._src.runtime.memory import require_episodes
 from jast._src.util import display
 from jast._src.util.checks import check_random_key, real_number, whole_number
+from jast._src.util.pytrees import index_tree
 
 __all__ = ["FailureProposal", "failure_proposal"]
 
@@ -215,7 +216,7 @@ def _play(key, sim, proposal):
     start, steps = proposal
     z0 = sequences.sample(for_noise, start, 0) if start != () else ()
     z = sequences.sample(for_noise, steps, 1)
-    player = sequences.latent_policy(sim, actions.quantiles(), jax.tree.map(lambda a: a[0], z0), z)
+    player = sequences.latent_policy(sim, actions.quantiles(), index_tree(z0, 0), z)
     e = rollout(for_start, sim, player)._replace(states=None, disturbances=None)
     # W = f(X; u) / f(X; v) in the latents, in which f is N(0, 1); to the end of the episode, as
     # later steps decide nothing
@@ -248,7 +249,7 @@ def _elites(e, log_w, quantile):
 
 
 def _start(start, steps):
-    return D.tilted(start(), *jax.tree.map(lambda a: a[0], steps))
+    return D.tilted(start(), *index_tree(steps, 0))
 
 
 def _disturbance(disturbance, steps, state, t):

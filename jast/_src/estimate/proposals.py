@@ -28,7 +28,7 @@ from jast._src.normal_space.transform import latents
 from jast._src.runtime._jax import is_traced
 from jast._src.util import display
 from jast._src.util.checks import real_number
-from jast._src.util.pytrees import conform
+from jast._src.util.pytrees import conform, index_tree
 
 __all__ = ["Proposal", "as_proposal", "policy_proposal", "trace_proposal"]
 
@@ -208,7 +208,7 @@ def as_proposal(function, sim, proposal):
         )
 
     def plays_one_value(start: Any, state: Any, dist: Any) -> bool:
-        policy = jax.tree.map(lambda a: a[0], proposal.policies)
+        policy = index_tree(proposal.policies, 0)
         pairs = (policy.start(), start), (policy.disturbance(state, jnp.int32(0)), None)
         return any(
             isinstance(q, D.Deterministic) and not isinstance(p, D.Deterministic) for q, p in pairs
@@ -249,7 +249,7 @@ def _stacked(sim, episodes):
     like = signature_of(sim)
     full = jax.tree.map(lambda s: jax.ShapeDtypeStruct((sim.horizon, *s.shape), s.dtype), like.x)
     for x0, x, _ in batched:
-        one = jax.tree.map(lambda a: a[0], (x0, x))
+        one = index_tree((x0, x), 0)
         try:
             conform("x0", one[0], like.x0), conform("disturbances", one[1], full)
         except ValueError as error:
@@ -275,7 +275,7 @@ def _trace_start(start, z, share):
 
 def _trace_step(disturbance, z, share, state, t):
     p = disturbance(state)
-    return _mixed(share, p, _moved(p, jax.tree.map(lambda a: a[t], z)))
+    return _mixed(share, p, _moved(p, index_tree(z, t)))
 
 
 def _policy_start(start, other, strength, share):

@@ -20,6 +20,7 @@ from jast._src.normal_space import transform
 from jast._src.normal_space.episode_point import number_names, number_steps, turned_in_time
 from jast._src.search.refine.modes import pointing
 from jast._src.util import checks, display
+from jast._src.util.pytrees import index_tree
 
 __all__ = ["Eigenfailures", "eigenfailures"]
 
@@ -88,7 +89,7 @@ class Eigenfailures(NamedTuple):
             f"{'':>2} {'nats':>7} {'variance':>8} {'shift':>6} {'at -1':>24} {'at +1':>24}"
         )
         for k, direction in enumerate(self.directions):
-            at = [_outcome(jax.tree.map(lambda a, k=k: a[k], e)) for e in (self.minus, self.plus)]
+            at = [_outcome(index_tree(e, k)) for e in (self.minus, self.plus)]
             lines.append(
                 f"{k + 1:2d} {self.nats[k]:7.3f} {self.variances[k]:8.3f} {self.shifts[k]:6.2f}"
                 f" {at[0]:>24} {at[1]:>24}"

@@ -20,7 +20,7 @@ from jast._src.core.simulator import Simulator
 from jast._src.normal_space.transform import side_by_side
 from jast._src.runtime._jax import jit
 from jast._src.search.refine.modes import Mode
-from jast._src.util.pytrees import as_partial
+from jast._src.util.pytrees import as_partial, index_tree
 
 __all__ = [
     "FullEpisodes",
@@ -74,7 +74,7 @@ def gather_episodes(function: str, argument: str, sim: Simulator, given: Any) ->
         raise refusal
     e = jax.tree.map(np.asarray, jax.device_get(e._replace(states=None)))
     if e.length.ndim == 0:
-        e = jax.tree.map(lambda a: a[None], e)
+        e = index_tree(e, None)
     if e.length.ndim != 1:
         raise ValueError(
             f"{function}: {argument} must have one leading axis, received the shape"
@@ -98,7 +98,7 @@ def distinct_rows(e: Episode) -> np.ndarray:
     """Rows of the first of each of the equal episodes [n]."""
     seen: dict[bytes, int] = {}
     for i in range(len(e.length)):
-        seen.setdefault(identity(jax.tree.map(lambda a, i=i: a[i], e)), i)
+        seen.setdefault(identity(index_tree(e, i)), i)
     return np.fromiter(seen.values(), int, len(seen))
 
 
@@ -137,7 +137,7 @@ def play_to_horizon(
 def _played_on(sim: Simulator, key: Any, at: Any, x0: Any, x: Any, length: Any) -> Any:
     def one(at, x0, x, length):
         e = play_back(sim, rewards.STANDARD, x0, x, length)
-        last = sim.disturbance(jax.tree.map(lambda a: a[length], e.states))
+        last = sim.disturbance(index_tree(e.states, length))
         keys = jax.random.split(jax.random.fold_in(key, at), sim.horizon)
         more = jax.vmap(lambda k: D.sample(last, k))(keys)
         live = jnp.arange(sim.horizon, dtype=jnp.int32) < length
@@ -158,7 +158,7 @@ def draw_ordinary(key: jax.Array, sim: Simulator, n: int) -> Episode:
     """At most ``n`` episodes of the model that do not fail."""
     at = np.arange(n, dtype=np.int32)
     e = side_by_side(sim, partial(_drawn, key, sim), at, lanes=LANES)
-    return jax.tree.map(lambda a: a[~e.failure], e)
+    return index_tree(e, ~e.failure)
 
 
 @jit

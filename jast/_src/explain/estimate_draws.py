@@ -16,6 +16,7 @@ from jast._src.estimate.estimate import Estimate
 from jast._src.estimate.exceedance_and_times import draws_and_level
 from jast._src.estimate.redraw import dimension_of, redraw_failures
 from jast._src.normal_space import transform
+from jast._src.util.pytrees import index_tree
 
 __all__ = ["UNRELIABLE", "failing_draws", "free_undecided", "normalised"]
 
@@ -78,7 +79,7 @@ def _chances(sim: Simulator, z: jax.Array) -> jax.Array:
     """[n, D]: the probability of each whole number of the episodes of ``z``, 0 of the others."""
 
     def one(e: Any) -> tuple[Any, Any]:
-        states = jax.tree.map(lambda a: a[:-1], replay(sim, e).states)
+        states = index_tree(replay(sim, e).states, np.s_[:-1])
         steps = jax.vmap(lambda s, x: chances(sim.disturbance(s), x))(states, e.disturbances)
         return chances(sim.start(), e.x0) if signature_of(sim).random_start else (), steps
 

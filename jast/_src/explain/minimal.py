@@ -14,6 +14,7 @@ from jast._src.normal_space.episode_point import EpisodePoint
 from jast._src.runtime.host_errors import runs_on_host
 from jast._src.util import display
 from jast._src.util.checks import number, whole_number
+from jast._src.util.pytrees import index_tree
 
 __all__ = ["MIN_HOSTED_BUDGET", "Minimal", "minimal"]
 
@@ -127,7 +128,7 @@ def minimal(
     kept = _find_needed(g, orders, budget)
     v = _shrink(g, np.where(kept, g.v, 0.0), budget)
     e = transform.played(g.sim, v[None])
-    e = jax.device_get(replay(sim, jax.tree.map(lambda a: a[0], e._replace(states=None))))
+    e = jax.device_get(replay(sim, index_tree(e._replace(states=None), 0)))
     kept &= episode_point.number_steps(sim) <= int(e.length)
     x0, needed = episode_point.like_disturbances(sim, kept)
     return Minimal(

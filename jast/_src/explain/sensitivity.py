@@ -21,6 +21,7 @@ from jast._src.explain.estimate_draws import UNRELIABLE, normalised
 from jast._src.normal_space import transform
 from jast._src.util import checks, display
 from jast._src.util.intervals import checked_level
+from jast._src.util.pytrees import index_tree
 
 __all__ = ["Sensitivity", "sensitivity"]
 
@@ -195,7 +196,7 @@ def _scores(sim: Simulator, z: jax.Array) -> jax.Array:
 
     def one(z):
         e = jax.lax.stop_gradient(transform.episodes(sim, z[None]))
-        e = jax.tree.map(lambda a: a[0], e._replace(states=None))
+        e = index_tree(e._replace(states=None), 0)
         slopes = jax.grad(log_p)([a for a, m in zip(leaves, moving, strict=True) if m], e)
         return jnp.concatenate([a.reshape(-1) for a in slopes])
 

@@ -12,6 +12,7 @@ from jast._src.explain.episodes import distinct_rows, gather_episodes, named_kin
 from jast._src.explain.held_out import DISTINCT
 from jast._src.explain.variants import EACH, draw_variants, find_seeds
 from jast._src.runtime.host_errors import runs_on_host
+from jast._src.util.pytrees import index_tree
 
 __all__ = ["given_cases", "simulate_cases"]
 
@@ -77,7 +78,7 @@ def simulate_cases(
         )
     n = failing + near
     return Cases(
-        episodes=jax.tree.map(lambda a: a[:n], e),
+        episodes=index_tree(e, np.s_[:n]),
         kind=kind[:n],
         group=group[:n],
         names=(OTHERS, *seeds.names),
@@ -103,7 +104,7 @@ def given_cases(
             names, each = named_kinds(function, labels, len(e.length))
             each = each + 1
         rows = distinct_rows(e)
-        parts.append(jax.tree.map(lambda a, rows=rows: a[rows], e))
+        parts.append(index_tree(e, rows))
         kind.append(each[rows])
         few = min((int(np.sum(kind[-1] == k)) for k in np.unique(each)), default=0)
         if few < least:

@@ -18,6 +18,7 @@ from jast._src.normal_space.episode_point import turned_in_time
 from jast._src.normal_space.evaluate_points import PointEvaluator
 from jast._src.normal_space.pcn import proposed
 from jast._src.search.refine.modes import Modes, owners
+from jast._src.util.pytrees import index_tree
 
 __all__ = ["EACH", "draw_variants", "find_seeds"]
 
@@ -82,7 +83,7 @@ def find_seeds(function: str, sim: Simulator, given: Any, labels: Any, most: int
     elif of_mode:
         names, label = _mode_names(n), np.arange(n)
     rows = distinct_rows(e)
-    e, label = jax.tree.map(lambda a: a[rows], e), label[rows]
+    e, label = index_tree(e, rows), label[rows]
     if not len(e.length):
         raise ValueError(f"{function}: failures must hold at least one failure, received none")
     z = transform.normal_of(sim, e)

@@ -12,6 +12,7 @@ from jast._src.core import rewards
 from jast._src.core.episode import play_back
 from jast._src.distributions.flat_rows import flat
 from jast._src.heads.heads import observation
+from jast._src.util.pytrees import index_tree
 
 __all__ = ["Samples", "cells", "samples_of_edges", "samples_of_episodes", "samples_of_roots"]
 
@@ -84,7 +85,7 @@ def _episode_rows(sim, actions, episodes, bins):
         def step(state, x):
             return observation(sim, state), _cell_of(actions, x, sim.disturbance(state), bins)
 
-        rows = jax.vmap(step)(jax.tree.map(lambda a: a[:-1], states), xs)
+        rows = jax.vmap(step)(index_tree(states, np.s_[:-1]), xs)
         return *rows, jnp.arange(sim.horizon, dtype=jnp.int32) < length
 
     return jax.vmap(one)(episodes)

@@ -26,7 +26,7 @@ from jast._src.heads.networks import make_head
 from jast._src.heads.samples import Samples, samples_of_edges, samples_of_episodes, samples_of_roots
 from jast._src.heads.train_head import HeadState, init_head, train_head
 from jast._src.runtime._jax import is_traced
-from jast._src.util.pytrees import count_numbers, shapes_text
+from jast._src.util.pytrees import count_numbers, index_tree, shapes_text
 
 __all__ = ["HeadTraining", "init_heads", "train_heads", "with_moments"]
 
@@ -196,7 +196,7 @@ def _samples(heads, sim, actions, settings, batches):
     if heads.policy is not None and settings.episodes:
         for b, g in good:
             # the best episode of each tree stands first
-            best = jax.tree.map(lambda a, g=g: a[: len(g)], b.found)
+            best = index_tree(b.found, np.s_[: len(g)])
             shares.append(samples_of_episodes(sim, actions, best, bins, g))
     if heads.value is not None and settings.edges == "all":
         edges = [samples_of_edges(b.edges, settings.target) for b in batches]

@@ -33,7 +33,7 @@ from jast._src.normal_space.sequences import latent_policy
 from jast._src.runtime._jax import jit, quick
 from jast._src.runtime.host_errors import runs_on_host
 from jast._src.util.blocked_matmul import product, rows_of
-from jast._src.util.pytrees import count_numbers, map_in_lanes, with_rows_of
+from jast._src.util.pytrees import count_numbers, index_tree, map_in_lanes, with_rows_of
 
 __all__ = [
     "Latent",
@@ -378,7 +378,7 @@ def latents(sim, recorded, of_start):
     def one(x0, x, length):
         # of states alone: where the disturbance depends on none, XLA drops the simulation
         states = play_back(sim, rewards.STANDARD, x0, x, length).states
-        states = jax.tree.map(lambda a: a[:-1], states)
+        states = index_tree(states, np.s_[:-1])
         z = jax.vmap(lambda s, x: D.to_normal(sim.disturbance(s), x))(states, x)
         live = jnp.arange(sim.horizon, dtype=jnp.int32) < length
         z = jax.tree.map(lambda a: jnp.where(live.reshape(-1, *(1,) * (a.ndim - 1)), a, 0), z)

@@ -1,11 +1,11 @@
 """The directions of `jast.explain.eigenfailures`, as numbers by step for the page of a report."""
 
-import jax
 import numpy as np
 
 from jast._src.core.episode import Episode
 from jast._src.page.episode_data import short
 from jast._src.util.leaf_names import named_numbers
+from jast._src.util.pytrees import index_tree
 from jast.explain import Eigenfailures
 
 __all__ = ["directions"]
@@ -23,7 +23,7 @@ def directions(found: Eigenfailures) -> list[dict]:
     for k, way in enumerate(found.directions):
         order = np.argsort(-np.abs(way), kind="stable")
         moved = dict.fromkeys(found.names[i] for i in order if found.steps[i] > 0)
-        both = (jax.tree.map(lambda a, k=k: a[k], e) for e in (found.minus, found.plus))
+        both = (index_tree(e, k) for e in (found.minus, found.plus))
         ends = [_columns(e, steps) for e in both]
         panels = [
             {"name": name, "columns": [end[name] for end in ends], "quiet": [middle[name]]}

@@ -15,6 +15,7 @@ from jast._src.core.episode import Episode, replay
 from jast._src.core.simulator import Simulator
 from jast._src.runtime.host_errors import runs_on_host
 from jast._src.util.leaf_names import named_fields, path_name
+from jast._src.util.pytrees import index_tree
 
 __all__ = ["exact", "far", "groups", "pictures", "short", "states_of", "trace"]
 
@@ -161,8 +162,8 @@ def pictures(
 
     def drawn(t: int) -> str:
         if t not in found:
-            past = {"past": jax.tree.map(lambda a: a[:t], states)} if trails else {}
-            found[t] = draw(jax.tree.map(lambda a: a[t], states), **past)
+            past = {"past": index_tree(states, np.s_[:t])} if trails else {}
+            found[t] = draw(index_tree(states, t), **past)
             if not isinstance(found[t], str):
                 raise ValueError(
                     f"{caller}: draw must return a str, an SVG or HTML fragment, received"

@@ -9,6 +9,7 @@ import numpy as np
 
 from jast._src.page.document import document, rows, write
 from jast._src.page.episode_data import groups, short
+from jast._src.util.pytrees import index_tree
 
 __all__ = ["nodes_of", "write_tree"]
 
@@ -77,7 +78,7 @@ def nodes_of(caller: str, result: Any, tree: int | None = None) -> Nodes:
 
 
 def _one(found: Any, tree: int, value: np.ndarray, target: int) -> Nodes:
-    own = jax.tree.map(lambda a: a[:, tree], found)
+    own = index_tree(found, np.s_[:, tree])
     row = np.flatnonzero(own.visits > 0)
 
     def below(root: Any, a: np.ndarray) -> np.ndarray:

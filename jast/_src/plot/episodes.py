@@ -18,6 +18,7 @@ from jast._src.plot import style
 from jast._src.plot.style import Axes
 from jast._src.search.result import SearchResult
 from jast._src.util.leaf_names import Field, named_fields
+from jast._src.util.pytrees import index_tree
 
 __all__ = ["disturbances", "distances", "disturbance_fields", "history", "shade_deviations"]
 
@@ -160,9 +161,9 @@ def disturbance_fields(sim: Simulator | None, episode: Episode) -> list[tuple[Fi
 @jax.jit
 def _spreads(sim: Simulator, episode: Episode) -> tuple[Any, Any]:
     """How far out x0 (``()`` where the start is fixed) and each disturbance [T, ...] are."""
-    states = jax.tree.map(lambda a: a[:-1], replay(sim, episode).states)
+    states = index_tree(replay(sim, episode).states, np.s_[:-1])
     rows = jax.tree.leaves(episode.disturbances)[0].shape[0]
-    states = jax.tree.map(lambda a: a[:rows], states)
+    states = index_tree(states, np.s_[:rows])
     steps = jax.vmap(lambda s, x: spread(sim.disturbance(s), x))(states, episode.disturbances)
     return spread(sim.start(), episode.x0) if jax.tree.leaves(episode.x0) else (), steps
 

@@ -21,6 +21,7 @@ from jast._src.search.refine.modes import Mode, Modes, owners
 from jast._src.search.result import SearchResult
 from jast._src.util.checks import whole_number
 from jast._src.util.leaf_names import named_numbers
+from jast._src.util.pytrees import index_tree
 from jast.estimate import FailureSamples
 
 __all__ = [
@@ -92,7 +93,7 @@ def samples_of(caller: str, samples: Any, sim: Any, modes: Any, most: int) -> Sa
         samples = samples.failures
     samples = samples.episodes if isinstance(samples, Failures) else samples
     if isinstance(samples, Episode) and not np.ndim(samples.length):
-        samples = jax.tree.map(lambda a: a[None], samples)
+        samples = index_tree(samples, None)
     if not isinstance(samples, Episode) or np.ndim(samples.length) != 1 or not len(samples.length):
         received = f"a {type(source).__name__} without any"
         if isinstance(samples, Episode):
@@ -103,7 +104,7 @@ def samples_of(caller: str, samples: Any, sim: Any, modes: Any, most: int) -> Sa
         )
     n = len(samples.length)
     rows = np.unique(np.linspace(0, n - 1, min(most, n)).round().astype(int))
-    few = jax.tree.map(lambda a: a[rows], samples)
+    few = index_tree(samples, rows)
     if modes is None or (isinstance(modes, Modes) and not len(modes)):
         return Samples(few, sim, None)
     if isinstance(modes, Modes):
@@ -217,7 +218,7 @@ def undisturbed_series(sim: Simulator) -> Series | None:
     if not (signature.start.mode and signature.disturbance.mode):
         return None
     quiet = rollout(jax.random.key(0), sim, undisturbed(sim))
-    return series_of(sim, jax.tree.map(lambda a: a[None], quiet))
+    return series_of(sim, index_tree(quiet, None))
 
 
 def choose_fields(

@@ -27,6 +27,7 @@ from jast._src.policies.actor import (
     network_inputs,
     parameter_shapes,
 )
+from jast._src.util.pytrees import index_tree
 
 __all__ = [
     "Batch",
@@ -222,7 +223,7 @@ def train(
         size = min(config.batch, n)
 
         def learn(learner, part):
-            return update(learner, networks, rates, rate, jax.tree.map(lambda a: a[part], batch))
+            return update(learner, networks, rates, rate, index_tree(batch, part))
 
         keys = jax.random.split(for_update, epochs)
         order = jax.vmap(lambda k: jax.random.permutation(k, n))(keys)

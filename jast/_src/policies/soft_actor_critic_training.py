@@ -26,6 +26,7 @@ from jast._src.policies.actor import (
     network_inputs,
     parameter_shapes,
 )
+from jast._src.util.pytrees import index_tree
 
 __all__ = ["Rates", "init_learner", "start_value", "train", "update"]
 
@@ -184,7 +185,7 @@ def train(
                 rates=rates._replace(learning_rate=rate),
                 acting=acting.astype(jnp.float32),
                 scale=training.scale,
-                rows=jax.tree.map(lambda a: a[at.astype(jnp.int32)], buffer),
+                rows=index_tree(buffer, at.astype(jnp.int32)),
                 horizon=sim.horizon,
             )
             return learner, loss + more

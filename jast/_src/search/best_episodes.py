@@ -13,6 +13,7 @@ from jast._src.core.simulator import Simulator
 from jast._src.search.driver import Log, finish
 from jast._src.search.lanes import Played, blank_episodes, distinct_episodes, take_rows
 from jast._src.search.result import SearchResult
+from jast._src.util.pytrees import index_tree
 
 __all__ = ["BestEpisodes", "standard_reward"]
 
@@ -66,10 +67,8 @@ class BestEpisodes(NamedTuple):
         """The `SearchResult` of a search (its ``sim``, ``reward`` and ``top``) of one tree."""
         best = jax.device_get(self)
         n = min(int(((best.value > -np.inf) & best.episode.failure).sum()), search.top)
-        first = jax.tree.map(lambda a: a[0], best.episode)
-        failing, numbers, counts = jax.tree.map(
-            lambda a: a[:n], (best.episode, best.number, best.count)
-        )
+        first = index_tree(best.episode, 0)
+        failing, numbers, counts = index_tree((best.episode, best.number, best.count), np.s_[:n])
         return finish(search, log, first, failing, numbers, counts=counts, settings=settings)
 
 

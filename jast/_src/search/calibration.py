@@ -25,7 +25,7 @@ from jast._src.runtime.host_errors import runs_on_host
 from jast._src.runtime.jax_settings import run_in_thread
 from jast._src.search.lanes import NEVER, Tally, blank_episodes, play_drawn
 from jast._src.search.result import SearchResult
-from jast._src.util.pytrees import select
+from jast._src.util.pytrees import index_tree, select
 
 __all__ = ["Calibration", "calibrate", "with_calibration"]
 
@@ -107,7 +107,7 @@ def _calibrated(
         (zero, zero > 0, none - 1, none + jnp.inf, episodes, Tally.none()),
     )
     best = jnp.where(jnp.any(shares > 0), jnp.argmax(shares), jnp.argmin(nearest))
-    plain = jax.tree.map(lambda a: a[:lanes], episodes)
+    plain = index_tree(episodes, np.s_[:lanes])
     log_p, distance = plain.reward, plain.distance
     likely = jnp.zeros((), real) if density == "mode" else jnp.max(log_p)
     likely = jnp.where(jnp.isfinite(likely), likely, 0)
@@ -170,7 +170,7 @@ def _best(sim: Simulator, reward: Any, e: Episode) -> Episode:
     """The best of the episodes, likeliest of those that failed or else nearest, as it replays."""
     score = jnp.where(e.failure, e.reward, -e.distance)
     i = jnp.argmax(jnp.where(e.failure | ~jnp.any(e.failure), score, -jnp.inf))
-    x0, x, length = jax.tree.map(lambda a: a[i], (e.x0, e.disturbances, e.length))
+    x0, x, length = index_tree((e.x0, e.disturbances, e.length), i)
     return play_back(sim, reward, x0, x, length)
 
 

@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 
 from jast._src.core import actions as choices
@@ -37,6 +38,7 @@ from jast._src.search.refine.final import default_share, with_refine_share
 from jast._src.search.result import SearchResult, Trials
 from jast._src.search.setup import default_actions, prepare
 from jast._src.util import checks
+from jast._src.util.pytrees import index_tree
 
 __all__ = ["cem"]
 
@@ -239,7 +241,7 @@ class _Search:
     def result(self, state: State, log: Log, settings: dict[str, Any]) -> SearchResult:
         found, tree, number, count = jax.device_get(_best_failures(state.elites, self.top))
         n = int((found.reward > -jnp.inf).sum())
-        found, tree, number, count = jax.tree.map(lambda a: a[:n], (found, tree, number, count))
+        found, tree, number, count = index_tree((found, tree, number, count), np.s_[:n])
         best = _best_episode(state.elites)
         return finish(self, log, best, found, number, counts=count, settings=settings, trees=tree)
 
@@ -294,11 +296,11 @@ def _propose(keys, sim, shares, plan, state):
     """Of one tree: the rows [samples, 1, ...] that x0 is made of (``()``: one start), and [samples,
     horizon, ...] those of x.
     """
-    elite = jax.tree.map(lambda a: a[: plan.elites], state.elites.episode)
+    elite = index_tree(state.elites.episode, np.s_[: plan.elites])
     start = signature_of(sim).random_start
     known = jnp.where(elite.reward > -jnp.inf, 1, -1)
     parents = (
-        (jax.tree.map(lambda a: a[:, None], elite.x0), known),
+        (index_tree(elite.x0, np.s_[:, None]), known),
         (elite.disturbances, jnp.where(known > 0, elite.length, -1)),
     )
 
@@ -313,8 +315,8 @@ def _propose(keys, sim, shares, plan, state):
 
 def _fit(proposals, elites, shares, plan):
     """The proposals of one tree, fitted to the elites at the steps that they reached."""
-    z, reward, length = jax.tree.map(
-        lambda a: a[: plan.elites], (elites.latent, elites.episode.reward, elites.episode.length)
+    z, reward, length = index_tree(
+        (elites.latent, elites.episode.reward, elites.episode.length), np.s_[: plan.elites]
     )
     known = reward[:, None] > -jnp.inf
     horizon = jax.tree.leaves(elites.episode.disturbances)[0].shape[1]
@@ -363,9 +365,9 @@ def _first_state(sim, plan, trees, k, width, around=()):
 @jax.jit
 def _best_episode(elites):
     """The best episode of all trees."""
-    e = jax.tree.map(lambda a: a[:, 0], elites.episode)
+    e = index_tree(elites.episode, np.s_[:, 0])
     i = jnp.argmax(jnp.where(e.failure | ~jnp.any(e.failure), e.reward, -jnp.inf))
-    return jax.tree.map(lambda a: a[i], e)
+    return index_tree(e, i)
 
 
 @partial(jax.jit, static_argnums=1)

@@ -14,7 +14,7 @@ from jast._src.core.signature import signature_of
 from jast._src.core.simulator import Simulator
 from jast._src.normal_space.sequences import disturbance_at
 from jast._src.normal_space.transform import latents
-from jast._src.util.pytrees import select
+from jast._src.util.pytrees import index_tree, select
 
 __all__ = ["latents_around", "copy_steps", "make_draw", "proposal_kinds"]
 
@@ -45,7 +45,7 @@ def copy_steps(key, values, lengths, fresh, part):
     known = jnp.sum(lengths >= 0, dtype=jnp.int32)
     p = jax.random.randint(parent, (steps,), 0, jnp.maximum(known, 1), jnp.int32)
     use = (jax.random.uniform(anew, (steps,), fresh.dtype) >= fresh) & (t < lengths[p])
-    return jax.tree.map(lambda a: a[p, t], values), use
+    return index_tree(values, (p, t)), use
 
 
 def make_draw(kind, actions, anew):
@@ -83,4 +83,4 @@ def latents_around(sim, actions, failures, settings):
     signature = signature_of(sim)
     of_start = signature.random_start and signature.start.quantile
     z0, z = latents(sim, (one.x0, one.disturbances, one.length), of_start)
-    return z0, jax.tree.map(lambda a: a[0], z)
+    return z0, index_tree(z, 0)

@@ -29,6 +29,7 @@ from jast._src.search.refine.final import SHARE, with_refine_share
 from jast._src.search.result import SearchResult
 from jast._src.util import checks
 from jast._src.util.display import call_settings
+from jast._src.util.pytrees import index_tree
 
 __all__ = ["chain"]
 
@@ -177,7 +178,7 @@ class _Search:
         widths = np.geomspace(max(WIDTHS[i], 1.0), self.narrowest, self.levels)
         real = points.z.dtype
         zero, scale = np.zeros(self.levels, real), np.full(self.levels, FIRST_SCALE, real)
-        chains = Chains(jax.tree.map(lambda a: a[rows], points), scale, zero, zero[1:])
+        chains = Chains(index_tree(points, rows), scale, zero, zero[1:])
         return chains, widths.astype(real)
 
     def result(self, state: State, log: Log, settings: dict[str, Any]) -> SearchResult:

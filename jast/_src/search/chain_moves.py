@@ -15,6 +15,7 @@ from jast._src.normal_space.pcn import proposed
 from jast._src.normal_space.transform import dimension, normal_numbers, split_point, used_numbers
 from jast._src.runtime._jax import jit
 from jast._src.search.lanes import Played, Tally, in_blocks, play_lanes
+from jast._src.util.pytrees import index_tree
 
 __all__ = ["Chains", "Points", "draw_wider", "move_chains", "no_points"]
 
@@ -136,7 +137,7 @@ def _exchanged(chains, widths, key, turn):
     level = jnp.arange(levels, dtype=jnp.int32)[:, None]
     source = level + jnp.concatenate([down, none]) + jnp.concatenate([none, up])
     column = jnp.broadcast_to(jnp.arange(each, dtype=jnp.int32)[None], source.shape)
-    points = jax.tree.map(lambda a: a[source, column], points)
+    points = index_tree(points, (source, column))
     ratio = (widths[:, None] / widths[source])[:, :, None]
     decides = number < points.used[:, :, None]
     points = points._replace(z=jnp.where(decides, points.z, ratio * points.z))
@@ -147,7 +148,7 @@ def _exchanged(chains, widths, key, turn):
 def play(sim: Simulator, reward: Any, z: jax.Array, live: jax.Array) -> Played:
     """The episodes of the points ``z`` [n, D], with their disturbances."""
     z0, steps = jax.vmap(partial(split_point, sim))(z)
-    rows = jax.tree.map(lambda a: a[None], z0), jax.tree.map(lambda a: jnp.moveaxis(a, 1, 0), steps)
+    rows = index_tree(z0, None), jax.tree.map(lambda a: jnp.moveaxis(a, 1, 0), steps)
     keys = jax.vmap(jax.random.key)(jnp.zeros(len(z), jnp.uint32))
 
     def draw(key, row, dist):

@@ -27,7 +27,7 @@ from jast._src.search.driver import Log, finish, require_counts, require_host, r
 from jast._src.search.lanes import NEVER, Tally
 from jast._src.search.result import SearchResult
 from jast._src.util.display import call_settings
-from jast._src.util.pytrees import count_numbers, map_in_lanes
+from jast._src.util.pytrees import count_numbers, index_tree, map_in_lanes
 
 __all__ = ["falsify"]
 
@@ -156,12 +156,12 @@ class _Search:
         u = np.concatenate([first, rows.reshape(n, -1)], axis=1)
         lanes = np.pad(u, ((0, self.batch - n), (0, 0)), mode="edge")
         o = jax.device_get(_outcomes(self.sim, lanes.astype(normal_numbers(self.sim))))
-        o = jax.tree.map(lambda a: a[:n], o)
+        o = index_tree(o, np.s_[:n])
         score = np.where(o.invalid, np.inf, np.where(o.failure, -1, o.distance))
         new = Pool(score, rows, first, o.length)
         pool = jax.tree.map(lambda *a: np.concatenate(a), pool, new)
         best = np.argsort(pool.score, kind="stable")[:POOL]
-        pool = jax.tree.map(lambda a: a[best], pool)
+        pool = index_tree(pool, best)
         failing = np.flatnonzero(o.failure)
         tally = Tally(
             episodes=n,
@@ -181,8 +181,8 @@ class _Search:
         u = state.failing if len(numbers) else nearest[None]
         normal = map_in_lanes(LANES, _normal, u.astype(normal_numbers(self.sim)))
         e = played(self.sim, normal)
-        failing = jax.tree.map(lambda a: a[: len(numbers)], e)
-        nearest = jax.tree.map(lambda a: a[0], e)
+        failing = index_tree(e, np.s_[: len(numbers)])
+        nearest = index_tree(e, 0)
         return finish(self, log, nearest, failing, numbers, settings=settings)
 
 

@@ -24,6 +24,7 @@ from jast._src.search.refine.final import with_refine_share
 from jast._src.search.refine.refine import GRADIENT, first_failing_lift, lift
 from jast._src.search.result import SearchResult
 from jast._src.util.display import call_settings
+from jast._src.util.pytrees import index_tree
 
 __all__ = ["gradient"]
 
@@ -147,7 +148,7 @@ class _Search:
             e = played(sim, lift(z).reshape(-1, dimension(sim)))
             _, rows = first_failing_lift(e.failure, len(z))
             if len(rows):
-                return self._scored(jax.tree.map(lambda a: a[rows], e))
+                return self._scored(index_tree(e, rows))
         return jax.device_get(blank_episodes(sim, 0))
 
     def _scored(self, e: Episode) -> Episode:
@@ -156,7 +157,7 @@ class _Search:
 
     def result(self, state: State, log: Log, settings: dict[str, Any]) -> SearchResult:
         failing, n = state.failing, len(state.failing.length)
-        nearest = jax.tree.map(lambda a: a[0], state.nearest)
+        nearest = index_tree(state.nearest, 0)
         settings = settings | dict(useful_gradients=round(float(state.useful), 4))
         return finish(self, log, nearest, failing, np.arange(n), settings=settings)
 

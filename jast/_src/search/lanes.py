@@ -19,7 +19,7 @@ from jast._src.core.transition import advance, begin, conclude
 from jast._src.runtime.host_errors import runs_on_host
 from jast._src.search.result import Trials
 from jast._src.search.tree.packing import pack
-from jast._src.util.pytrees import select, zero_where
+from jast._src.util.pytrees import index_tree, select, zero_where
 
 __all__ = [
     "EMPTY_HASH",
@@ -126,11 +126,11 @@ def play_lanes(sim, reward, keys, draw_start, draw, live, rows=((), ()), record=
     start = int(like.random_start)
     if runs_on_host(sim):  # which runs nothing twice: what is not live does what another lane does
         like_lane = jnp.where(live, jnp.arange(len(live)), jnp.argmax(live))
-        keys, rows = keys[like_lane], jax.tree.map(lambda a: a[:, like_lane], rows)
+        keys, rows = keys[like_lane], index_tree(rows, np.s_[:, like_lane])
 
     def at(level, rows, t):
         own = jax.vmap(jax.random.fold_in, (0, None))(keys, level)
-        return own, jax.tree.map(lambda a: a[t], rows)
+        return own, index_tree(rows, t)
 
     def first(key, row):
         x0 = draw_start(key, row, sim.start()) if start else ()

@@ -30,7 +30,7 @@ from jast._src.search.lanes import Tally, distinct_episodes, in_blocks, play_dra
 from jast._src.search.refine.final import default_share, with_refine_share
 from jast._src.search.result import SearchResult, Trials
 from jast._src.search.setup import prepare
-from jast._src.util.pytrees import map_in_lanes, select
+from jast._src.util.pytrees import index_tree, map_in_lanes, select
 
 __all__ = ["monte_carlo"]
 
@@ -142,7 +142,7 @@ def monte_carlo(
                 f" transformation, received {episodes} x {sim.horizon}"
             )
         found, tally = _chunk(*parts, _nothing(sim, 1), 0, episodes, lanes)
-        best = jax.tree.map(lambda a: a[0], _rebuild(*parts, found.number[None]))
+        best = index_tree(_rebuild(*parts, found.number[None]), 0)
         return finish_traced(sim, reward, tally, best, found.reward[None])
 
     if record:
@@ -182,7 +182,7 @@ def monte_carlo(
     numbers = np.concatenate([found.number[None], found.top.number])
     rebuilt = jax.device_get(_rebuilt(parts, numbers))
     n = int((found.top.reward > -np.inf).sum())
-    best, failing = (jax.tree.map(lambda a, i=i: a[i], rebuilt) for i in (0, slice(1, n + 1)))
+    best, failing = (index_tree(rebuilt, i) for i in (0, slice(1, n + 1)))
     numbers, counts = found.top.number[:n], found.top.count[:n]
     found = finish(job, log, best, failing, numbers, counts=counts, settings=settings)
     return complete(key, job, found, before, elsewhere=ran.incidents)
@@ -219,7 +219,7 @@ def _unit(job, number, context):
         found, tally, played = _block(*about, job.nothing, begin, end, job.lanes)
     else:
         return *_chunk(*about, job.nothing, begin, end, job.lanes), None
-    trials = jax.tree.map(lambda a: a[: end - begin, None], played.trials()) if job.record else None
+    trials = index_tree(played.trials(), np.s_[: end - begin, None]) if job.record else None
     return found, tally, trials
 
 

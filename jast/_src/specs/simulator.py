@@ -17,7 +17,7 @@ from jast._src.core.simulator import Simulator
 from jast._src.specs import monitor
 from jast._src.specs.formulas import Formula, checked_formula, predicates
 from jast._src.specs.robustness import fits, margins, spacing
-from jast._src.util.pytrees import as_partial
+from jast._src.util.pytrees import as_partial, index_tree
 
 __all__ = ["Monitored", "goes_on", "trace_of", "under"]
 
@@ -212,7 +212,7 @@ def _monitored(function: str, episode: Any) -> Monitored:
 
 def _init(watch: _Watch, x0: Any) -> Monitored:
     state = watch.sim.init(x0)
-    rows = jax.tree.map(lambda a: a[-1:], _samples_of(watch.samples, state))
+    rows = index_tree(_samples_of(watch.samples, state), np.s_[-1:])
     given = margins("under", watch.formula, rows)
     memory = monitor.begin(watch.formula, watch.dt, watch.total, given[0].dtype)
     start = jnp.zeros((), jnp.int32)

@@ -10,6 +10,9 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
+
+from jast._src.util.pytrees import index_tree
 
 __all__ = ["Pair", "exact", "over", "soft", "until"]
 
@@ -47,7 +50,7 @@ def over(op: Callable, x: Any, first: int, last: int, beyond: Any, overlap: bool
     y, n = jax.tree.map(partial(_continued, rows, first), x, beyond), 1
 
     def cut(y, start, length):
-        return jax.tree.map(lambda a: a[start : start + length], y)
+        return index_tree(y, np.s_[start : start + length])
 
     found, done = None, 0
     while True:  # y[t] is that of the n numbers from t on

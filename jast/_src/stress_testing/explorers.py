@@ -31,6 +31,7 @@ from jast._src.search.go_explore.go_explore import go_explore
 from jast._src.search.monte_carlo import monte_carlo
 from jast._src.util.display import call_settings
 from jast._src.util.intervals import clopper_pearson
+from jast._src.util.pytrees import index_tree
 
 __all__ = [
     "EXPLORERS",
@@ -89,7 +90,7 @@ def nominal_points(key: jax.Array, sim: Simulator, episodes: int) -> tuple[Nomin
     offers = [signature.disturbance, *([signature.start] if signature.random_start else [])]
     if all(o.mode_is_median for o in offers):
         e = transform.played(sim, np.zeros((1, transform.dimension(sim))))
-        quiet = replay(sim, jax.tree.map(lambda a: a[0], e), reward=reward)
+        quiet = replay(sim, index_tree(e, 0), reward=reward)
     elif all(o.mode for o in offers):
         quiet = rollout(key, sim, undisturbed(sim), reward)  # draws nothing
     found, distance = _draw_points(key, sim, episodes)
@@ -235,7 +236,7 @@ def failures_at(sim: Simulator, points: np.ndarray) -> ExplorerResult:
     if not len(points):
         return ExplorerResult(empty(sim).episodes, 0, 0, 0)
     e = transform.played(sim, points)
-    e = jax.tree.map(lambda a: a[e.failure], e)
+    e = index_tree(e, e.failure)
     return ExplorerResult(e, len(points), len(e.length), 0)
 
 

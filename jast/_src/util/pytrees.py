@@ -17,6 +17,7 @@ __all__ = [
     "count_numbers",
     "conform",
     "fields_of",
+    "index_tree",
     "map_in_lanes",
     "pad_rows",
     "select",
@@ -87,6 +88,11 @@ class _WithFunctions:
 def select(pred: Any, a: Any, b: Any) -> Any:
     """``a`` where the scalar ``pred`` holds, else ``b``."""
     return jax.tree.map(lambda x, y: jnp.where(pred, x, y), a, b)
+
+
+def index_tree(tree: Any, where: Any) -> Any:
+    """Each array of ``tree`` at ``where``: a number, rows, a mask, or a slice (`numpy.s_`)."""
+    return jax.tree.map(lambda a: a[where], tree)
 
 
 def with_rows_of(like: jax.Array, tree: Any) -> Any:

@@ -112,9 +112,6 @@ class GaussianFamily(NamedTuple):
         """`Points` of failing ones, at no cost."""
         return state, Points(np.asarray(z), np.asarray(used))
 
-    def select(self, points: Points, rows: np.ndarray) -> Points:
-        return Points(points.z[rows], points.used[rows])
-
     def on_device(self, q: transform.Latent) -> transform.Latent:
         return q
 

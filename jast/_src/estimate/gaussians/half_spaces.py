@@ -22,6 +22,7 @@ from jast._src.estimate.gaussians.mixture_fit import (
 from jast._src.estimate.proposal_search.settings import SETTINGS
 from jast._src.normal_space.moments import Linearised
 from jast._src.normal_space.transform import Latent
+from jast._src.util.pytrees import index_tree
 
 __all__ = [
     "Planes",
@@ -73,10 +74,6 @@ class Planes(NamedTuple):
     gap: np.ndarray
     """From where it was linearised to its nearest failing point"""
 
-    def take(self, rows: np.ndarray) -> Planes:
-        """Some of them."""
-        return Planes(*(a[rows] for a in self))
-
     @property
     def log_mass(self) -> np.ndarray:
         """[K] logs of their probabilities."""
@@ -112,7 +109,7 @@ def planes_of(here: Linearised) -> Planes:
     beyond = here.distance[moment] / size[moment]
     depth = normal @ here.point + beyond
     gap = np.linalg.norm(depth[:, None] * normal - here.point, axis=1)
-    return Planes(normal, depth, moment, size[moment], gap).take(depth > 0)
+    return index_tree(Planes(normal, depth, moment, size[moment], gap), depth > 0)
 
 
 def merge_planes(old: Planes, new: Planes) -> Planes:
@@ -124,7 +121,7 @@ def merge_planes(old: Planes, new: Planes) -> Planes:
         same = [j for j in kept if both.moment[j] == both.moment[i]]
         if not same or (both.normal[same] @ both.normal[i]).max() < SAME:
             kept.append(i)
-    return both.take(np.sort(kept))
+    return index_tree(both, np.sort(kept))
 
 
 def that_matter(planes: Planes, d: int) -> Planes:
@@ -138,7 +135,7 @@ def that_matter(planes: Planes, d: int) -> Planes:
     for i in order:
         if len(kept) < most and (planes.normal[kept] @ planes.normal[i]).max(initial=-1) < ALIKE:
             kept.append(i)
-    return planes.take(kept)
+    return index_tree(planes, kept)
 
 
 def first_layers(planes: Planes) -> Layers:

@@ -27,6 +27,7 @@ from jast._src.estimate.proposal_search.search_state import (
     failure_log_ratios,
 )
 from jast._src.normal_space.moments import cost_of_slopes, distances, slopes
+from jast._src.util.pytrees import index_tree
 
 __all__ = ["explore_moments"]
 
@@ -160,13 +161,14 @@ def _with_mirror_images(f, state, planes):
     """
     images = planes._replace(normal=-planes.normal)
     k = len(planes.depth)
-    images = images.take([len(merge_planes(planes, images.take([i])).depth) > k for i in range(k)])
+    each = [index_tree(images, [i]) for i in range(k)]
+    images = index_tree(images, [len(merge_planes(planes, one).depth) > k for one in each])
     if not len(images.depth):
         return state, planes
     beyond = (images.depth + KNOWN)[:, None] * images.normal
     failure = np.asarray(distances(f.sim, beyond.astype(f.dtype))[0].failure)
     text = f"moments: {failure.sum()} of {len(failure)} mirror images fail"
-    both = zip(planes, images.take(failure), strict=True)
+    both = zip(planes, index_tree(images, failure), strict=True)
     planes = that_matter(Planes(*map(np.concatenate, both)), f.dimension)
     return state.note(text, len(failure)), planes
 

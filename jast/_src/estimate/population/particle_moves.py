@@ -22,6 +22,7 @@ from jax import lax
 from jast._src.core.simulator import Simulator
 from jast._src.normal_space.transform import dimension, normal_numbers, outcome_by_level
 from jast._src.runtime.device import block_size
+from jast._src.util.pytrees import index_tree
 
 __all__ = [
     "AFTER",
@@ -220,7 +221,7 @@ def _move_on_device(sim, particles, key, rows, size, live, moves, kinds, level, 
         size, accepted = size.at[i].set(steered), accepted.at[i].set(share)
         return particles, size, accepted, invalid + wrong
 
-    particles = jax.tree.map(lambda a: a[rows], particles)
+    particles = index_tree(particles, rows)
     unused = number >= particles.used[:, None]
     particles = particles._replace(z=jnp.where(unused, ratio * particles.z, particles.z))
     start = particles, size, jnp.zeros_like(size), jnp.zeros((), jnp.int32)

@@ -25,6 +25,7 @@ from jast._src.estimate.proposal_search.search_state import (
     pooled_log_ratio,
 )
 from jast._src.normal_space.transform import dimension
+from jast._src.util.pytrees import index_tree
 
 __all__ = ["audit_proposal", "uncovered"]
 
@@ -83,7 +84,7 @@ def _absorb(family, state, missing):
     for m in missing:
         if (rows := uncovered(family, after, m.points)).any():
             share = least if math.isnan(m.share) else m.share
-            found.append((family.select(m.points, rows), share))
+            found.append((index_tree(m.points, rows), share))
             after = family.absorb(state, found)
     return after
 
@@ -179,7 +180,7 @@ def _missing(family, state, cooled, explored):
         state, points = family.as_points(state, p.points, p.used)
         rows = uncovered(family, state, points)
         part = rows.sum() / max(len(rows), 1)
-        missing.append(Missing(share * part, family.select(points, rows)))
+        missing.append(Missing(share * part, index_tree(points, rows)))
         state = state.note(f"audit: {share:.2%} of the probability, {part:.0%} not covered")
     missing = [m for m in missing if _unseen_mass(family, state, m) > settings.tolerated_mass]
     if cooled is not None:
@@ -187,7 +188,7 @@ def _missing(family, state, cooled, explored):
         state = state.note(f"audit: {rows.sum()} of {len(rows)} failures moved not covered")
         by_chance = rows.sum() <= max(settings.stray_share * len(rows), settings.stray_count)
         if not by_chance or (rows.any() and _has_few_numbers(family)):
-            missing.append(Missing(math.nan, family.select(cooled, rows), by_chance))
+            missing.append(Missing(math.nan, index_tree(cooled, rows), by_chance))
     return state, missing
 
 

@@ -172,9 +172,6 @@ class Family(Protocol):
         many numbers; and the state, with what this costs.
         """
 
-    def select(self, points: Any, rows: np.ndarray) -> Any:
-        """Some of the ``points``."""
-
     def on_device(self, q: Any) -> Any:
         """``q`` as an `Estimate` has it."""
 

@@ -26,6 +26,7 @@ from jast._src.core.transition import Progress, advance, begin, blank, conclude
 from jast._src.estimate.splitting.levels import FRESH, Played
 from jast._src.runtime._jax import jit
 from jast._src.runtime.memory import require, size
+from jast._src.util.pytrees import index_tree
 
 __all__ = ["DevicePaths", "require_paths"]
 
@@ -138,7 +139,7 @@ def _play(store, key, time, sim, score, paths, parents, level, m):
         first = jax.vmap(partial(_first, sim, score))(
             keys,
             parents[at] == FRESH,
-            jax.tree.map(lambda a: a[row[at], parents[at]], store.states),
+            index_tree(store.states, (row[at], parents[at])),
             store.scores[row[at], parents[at]],
             step[at],
             at < m,

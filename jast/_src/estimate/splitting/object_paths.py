@@ -17,6 +17,7 @@ from jast._src.core.signature import signature_of
 from jast._src.core.simulator import Simulator
 from jast._src.estimate.splitting.levels import FRESH, Played
 from jast._src.runtime._jax import quick
+from jast._src.util.pytrees import index_tree
 
 __all__ = ["ObjectPaths"]
 
@@ -109,7 +110,7 @@ class ObjectPaths:
         x0s = jax.device_get(_draw_starts(self.sim, self.key, np.int32(self.times)))
         lanes = []
         for i in range(count):
-            x0 = jax.tree.map(lambda a, i=i: a[i], x0s)
+            x0 = index_tree(x0s, i)
             thing, look = self.objects.begin(jax.tree.leaves(x0))
             state = self.blank._replace(begun=np.ones((), bool), x0=x0)
             lanes.append(Lane(_with_look(state, look), thing, self.sim.horizon))

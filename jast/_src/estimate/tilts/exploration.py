@@ -31,6 +31,7 @@ from jast._src.estimate.tilts.family import Mixture, Points, TiltFamily, at_leve
 from jast._src.estimate.tilts.tilts import interval_starts, stack_choices
 from jast._src.normal_space.transform import normal_numbers, side_by_side
 from jast._src.runtime._jax import quick
+from jast._src.util.pytrees import index_tree
 
 __all__ = ["absorb_given", "cool_failures", "descend_levels", "replay_given"]
 
@@ -121,7 +122,7 @@ def replay_given(f: TiltFamily, state: SearchState, failures: Failures | None) -
         return state
     most = int(f.settings.given_replay_share * f.budget)
     rows = np.unique(np.linspace(0, n - 1, min(n, most)).astype(int))
-    z = numbers_of_episodes(f.sim, jax.tree.map(lambda a: a[rows], failures.episodes))
+    z = numbers_of_episodes(f.sim, index_tree(failures.episodes, rows))
     state, found = _failing(f, state, z)
     state = state.note(f"failures given: {len(found.z)} of {len(z)} fail again")
     return state._replace(given=found) if len(found.z) else state
@@ -172,7 +173,7 @@ def _failing(f, state, z):
     """The state, and `Given` of those of the points ``z`` that fail."""
     failing, points = f.play_again(z)
     state = state._replace(spent=state.spent + len(z))
-    return state, Given(np.asarray(z)[failing], f.select(points, failing))
+    return state, Given(np.asarray(z)[failing], index_tree(points, failing))
 
 
 def numbers_of_episodes(sim: Simulator, given: Episode) -> np.ndarray:
@@ -191,7 +192,7 @@ def numbers_of_episodes(sim: Simulator, given: Episode) -> np.ndarray:
 def _numbers(sim, x0, disturbances, length):
     def one(x0, x, length):
         e = play_back(sim, log_likelihood, x0, x, length)
-        states = jax.tree.map(lambda a: a[:-1], e.states)
+        states = index_tree(e.states, np.s_[:-1])
         first = _numbers_of_value(parts(sim.start()), e.x0)
         of_steps = jax.vmap(lambda s, x: _numbers_of_value(parts(sim.disturbance(s)), x))
         z = of_steps(states, e.disturbances)

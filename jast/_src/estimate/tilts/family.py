@@ -41,6 +41,7 @@ from jast._src.estimate.tilts.tilts import (
     step_numbers,
 )
 from jast._src.normal_space.transform import normal_numbers
+from jast._src.util.pytrees import index_tree
 
 __all__ = ["Mixture", "Points", "TiltFamily", "at_level"]
 
@@ -163,10 +164,7 @@ class TiltFamily(NamedTuple):
     def as_points(self, state: SearchState, z: Any, used: Any) -> tuple[SearchState, Points]:
         """`Points` of the failing episodes of ``z`` [m, D], which are played again for it."""
         failing, points = self.play_again(z)
-        return state._replace(spent=state.spent + len(z)), self.select(points, failing)
-
-    def select(self, points: Points, rows: np.ndarray) -> Points:
-        return jax.tree.map(lambda a: a[rows], points)
+        return state._replace(spent=state.spent + len(z)), index_tree(points, failing)
 
     def exclusion(self, q: Mixture, threshold: float) -> tuple[Tilts, float]:
         return self.on_device(q), threshold
@@ -238,7 +236,7 @@ def at_level(family: TiltFamily, q: Mixture, p: Play, level: float) -> Batch:
     near = np.flatnonzero(p.score <= level)
     rows = near[: family.settings.failures_kept]
     size = len(p.score) * len(rows) // len(near) if len(near) else len(p.score)
-    return Batch(q, family.select(p.points, rows), p.log_weight[rows], size)
+    return Batch(q, index_tree(p.points, rows), p.log_weight[rows], size)
 
 
 def _join(*points: Points) -> Points:

@@ -35,6 +35,7 @@ from jast._src.search.refine.final import SHARE, with_refine_share
 from jast._src.search.result import SearchResult
 from jast._src.util import checks
 from jast._src.util.display import call_settings
+from jast._src.util.pytrees import index_tree
 
 __all__ = ["go_explore"]
 
@@ -218,7 +219,7 @@ class _Search:
             far = np.abs(mark[left][:, None] - mark[rows][None]).sum(axis=2).min(axis=1)
             rows.append(left.pop(int(np.argmax(far)) if len(rows) % 2 else 0))
         rows = np.resize(rows, self.plan.traces)
-        return _traces(jax.tree.map(lambda a: a[rows], e))
+        return _traces(index_tree(e, rows))
 
     def result(self, state: State, log: Log, settings: dict[str, Any]) -> SearchResult:
         return state.best.result(self, log, settings)

@@ -23,7 +23,7 @@ from jast._src.search.go_explore.continued_runs import (
     start_point,
 )
 from jast._src.search.lanes import Tally, in_blocks, select_lanes
-from jast._src.util.pytrees import select
+from jast._src.util.pytrees import index_tree, select
 
 __all__ = ["Plan", "Traces", "improve_backward", "explore"]
 
@@ -70,7 +70,7 @@ def explore(key, sim, reward, cell, plan, cells, best, begin, end):
         anew = (coins[:, 2] < FROM_START) | ~jnp.any(cells.live)
         x0 = jax.vmap(lambda k, own: draw_start(k, own, sim.start()))(keys, noise)
         first = jax.vmap(partial(start_point, sim, reward), axis_size=plan.lanes)(x0)
-        kept = jax.tree.map(lambda a: a[slot], cells)
+        kept = index_tree(cells, slot)
         points, x0 = select_lanes(anew, (first, x0), (kept.points, kept.x0))
         until = jnp.where(live, points.t + length, 0)
         ends, new, xs, points_on = continue_runs(
@@ -113,7 +113,7 @@ def improve_backward(key, sim, reward, plan, best, traces, begin, end, since, wh
         points, steps, _, _ = continue_runs(
             sim, reward, keys[:p], first, until, _copied, traces.rows, sim.horizon
         )
-        mine, points, back = jax.tree.map(lambda a: a[own_of], (traces, points, back))
+        mine, points, back = index_tree((traces, points, back), own_of)
         own, x0 = _ways(coins, mine, back), mine.x0
         if signature_of(sim).random_start:
             moved = jax.vmap(lambda k, own: draw_start(k, own, sim.start()))(keys, own)
@@ -133,7 +133,7 @@ def improve_backward(key, sim, reward, plan, best, traces, begin, end, since, wh
 
 
 def _copied(key, t, rows, dist):
-    return jax.tree.map(lambda a: a[t], rows)
+    return index_tree(rows, t)
 
 
 def _keys_and_coins(sim, key, number):
@@ -170,7 +170,7 @@ def _bettered(traces, played, live):
     value = jnp.where(e.failure & live, e.reward, -jnp.inf).reshape(-1, p)
     row = jnp.argmax(value, axis=0) * p + jnp.arange(p)
     new = Traces(e.x0, e.disturbances, e.length, e.reward)
-    new = jax.tree.map(lambda a: a[row], new)
+    new = index_tree(new, row)
     return select_lanes(jnp.max(value, axis=0) > traces.reward, new, traces)
 
 

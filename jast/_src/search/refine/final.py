@@ -17,6 +17,7 @@ from jast._src.runtime.jax_settings import run_in_thread
 from jast._src.search.refine.refine import refine
 from jast._src.search.result import SearchResult
 from jast._src.util import checks
+from jast._src.util.pytrees import index_tree
 
 __all__ = ["REFINED", "SHARE", "default_share", "refine_failures", "with_refine_share"]
 
@@ -117,7 +118,7 @@ def _refined(
     rows = [i for i, e in enumerate(refined.failures) if identity(e) not in known]
     best = found.best
     if rows:
-        new = jax.tree.map(lambda a: a[np.array(rows)], refined.failures.episodes)
+        new = index_tree(refined.failures.episodes, np.array(rows))
         where = np.full(len(rows), REFINED), np.array(rows)
         archive = merge(archive, collect(sim, reward, new, *where, seen=0, top=top), top=top)
         if not best.failure or archive.best.reward > best.reward:

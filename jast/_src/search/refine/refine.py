@@ -23,7 +23,7 @@ from jast._src.search.refine.connectivity import distinct_points
 from jast._src.search.refine.round import first_points, residuals, round_of
 from jast._src.util import checks, display
 from jast._src.util.display import call_settings
-from jast._src.util.pytrees import count_numbers
+from jast._src.util.pytrees import count_numbers, index_tree
 
 __all__ = ["GRADIENT", "Refined", "first_failing_lift", "lift", "refine"]
 
@@ -315,9 +315,9 @@ class _Refinement:
             lifted = lift(points.v.astype(np.float64))[: HOSTED_LIFTS if self.hosted else None]
             tries = played(self.of_modes, lifted.reshape(-1, self.v.shape[1]))
         for i in range(n):
-            own = jax.tree.map(lambda a, i=i: a[origin[i]], self.given)
+            own = index_tree(self.given, origin[i])
             each = range(i, len(tries.length), n)
-            lifts = (jax.tree.map(lambda a, k=k: a[k], tries) for k in each)
+            lifts = (index_tree(tries, k) for k in each)
             for e in (*lifts, own):
                 # compiled programs may differ on a knife edge: what the replay says counts
                 e = replay(self.sim, e, reward=reward)._replace(states=None)

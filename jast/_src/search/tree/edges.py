@@ -15,6 +15,7 @@ from jast._src.search.tree.best_episode import fed_source
 from jast._src.search.tree.layout import choose, choose_child, flags, node_keys, nodes_of
 from jast._src.search.tree.pages import CHILD, RETURNS, VISITS, edge_of
 from jast._src.util import display
+from jast._src.util.pytrees import index_tree
 
 __all__ = ["Branches", "Edges", "branches_of", "edges_of"]
 
@@ -50,7 +51,7 @@ def edges_of(problem, tree, children, axes=None):
         """A tree's, [S, ...]."""
 
         def edge(parent, slot):
-            state = jax.tree.map(lambda a: a[parent], states)
+            state = index_tree(states, parent)
             node_key = node_keys(keys[None], parent[None])[0]
             _, x = choose_child(problem, node_key, slot, state)
             return observation(problem.sim, state), flat(x)
@@ -113,7 +114,7 @@ def branches_of(problem, tree, children, axes=None):
         """A tree's, [S, ...]."""
 
         def edge(parent, slot, level, source, fed):
-            state = jax.tree.map(lambda a: a[parent], states)
+            state = index_tree(states, parent)
             return choose(problem, key, parent, slot, level, state, source, fed)
 
         return jax.vmap(edge)(*of)

@@ -4,13 +4,14 @@ none has to be stored.
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 
 from jast._src.core.episode import Episode
 from jast._src.core.transition import blank
 from jast._src.search.tree.best_episode import fed_of, fed_source
 from jast._src.search.tree.layout import choose, choose_rollout, flags, nodes_of, of_lanes, take
-from jast._src.util.pytrees import select, zero_where
+from jast._src.util.pytrees import index_tree, select, zero_where
 
 __all__ = ["rebuild"]
 
@@ -38,11 +39,11 @@ def _one(problem, axes, tree, lane, i, memoize):
     # choices made in the tree; those of the rollout follow
     depth = jnp.sum(nodes > 0, dtype=jnp.int32)
     rolling = jax.random.fold_in(key, i)
-    begin = jax.tree.map(lambda a: a[lane], tree.origin)
+    begin = index_tree(tree.origin, lane)
 
     def down(at, level):
         up_there = jnp.clip(depth - 1 - level, 0, height - 1)
-        parent, slot, source = jax.tree.map(lambda a: a[up_there], (parents, slots, sources))
+        parent, slot, source = index_tree((parents, slots, sources), up_there)
         taken = source, fed_source(tree, source, lane)
         chosen = choose(problem, key, parent, slot, level, at.state, *taken)
         rolled = choose_rollout(problem, rolling, key, level, at.state, fed_of(tree, i, lane))
@@ -53,7 +54,7 @@ def _one(problem, axes, tree, lane, i, memoize):
     start = blank(sim, begin)._replace(done=tree.ended[lane])
     end, (x0s, xs, lived) = lax.scan(down, start, jnp.arange(height, dtype=jnp.int32))
     first = height - sim.horizon
-    x0 = jax.tree.map(lambda a: a[0], x0s)
+    x0 = index_tree(x0s, 0)
     steps = jnp.sum(lived[first:], dtype=jnp.int32)
-    xs = jax.tree.map(lambda a: a[first:], xs)
+    xs = index_tree(xs, np.s_[first:])
     return Episode(x0, xs, end.log_prob, end.distance, failed, steps, tree.log[i, lane])

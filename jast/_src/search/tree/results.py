@@ -13,6 +13,7 @@ from jast._src.search.lanes import NEVER, Tally
 from jast._src.search.result import History, SearchResult, Trials
 from jast._src.search.tree.layout import flags
 from jast._src.search.tree.run import Traced, TreeBatch
+from jast._src.util.pytrees import index_tree
 
 __all__ = ["result", "traced_result"]
 
@@ -70,7 +71,7 @@ def _beside(parts: list[Any]) -> Any:
 
 def _misses(batches: list[TreeBatch], top: int) -> Episode:
     """The ``top`` best episodes of trees that found no failure, one a tree, by falling reward."""
-    own = [jax.tree.map(lambda a, h=h: a[: h.log.shape[1]], h.found) for h in batches]
+    own = [index_tree(h.found, np.s_[: h.log.shape[1]]) for h in batches]
     best = jax.tree.map(lambda *parts: np.concatenate(parts), *own)
     rows = np.flatnonzero(~best.failure & np.isfinite(best.reward))
     return _take(best, rows[np.argsort(-best.reward[rows], kind="stable")][:top])
@@ -122,9 +123,9 @@ def traced_result(sim: Any, reward: Any, found: Traced) -> SearchResult:
         first=jnp.where(jnp.any(found.failures > 0), order, NEVER),
         failing=failing,
     )
-    best = jax.tree.map(lambda a: a[jnp.argmax(score)], found.best)
+    best = index_tree(found.best, jnp.argmax(score))
     return finish_traced(sim, reward, tally, best, rewards)
 
 
 def _take(episodes: Episode, i: Any) -> Episode:
-    return Episode(*jax.tree.map(lambda a: a[i], tuple(episodes[:-1])))
+    return Episode(*index_tree(tuple(episodes[:-1]), i))

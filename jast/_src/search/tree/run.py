@@ -23,6 +23,7 @@ from jast._src.search.tree.edges import branches_of, edges_of
 from jast._src.search.tree.layout import Problem, flags, make
 from jast._src.search.tree.prune import prune, recounted
 from jast._src.search.tree.rebuild import rebuild
+from jast._src.util.pytrees import index_tree
 
 __all__ = ["Plan", "Round", "Traced", "TreeBatch", "bytes_per_tree", "grow_all", "grow_traced"]
 
@@ -182,7 +183,7 @@ def _one_group(turn: Round, number: int, context: UnitContext) -> TreeBatch:
     wanted = candidates + len(group)
     rows = (np.resize(a, wanted).astype(np.int32) for a in (lane, i))
     found = _rebuild(problem, tree, *rows, plan.memoize)
-    found = jax.tree.map(lambda a: a[: len(lane)], jax.device_get(found))
+    found = index_tree(jax.device_get(found), np.s_[: len(lane)])
     none = jax.tree.map(np.zeros_like, turns[0])
     turns += [none] * (plan.prunes - len(turns))
     roots = jax.tree.map(lambda *rows: np.stack(rows), *turns)
@@ -190,8 +191,8 @@ def _one_group(turn: Round, number: int, context: UnitContext) -> TreeBatch:
         roots = jax.device_get(_recounted(problem, tree, roots, plan.children, plan.memoize))
     edges = _edges(problem, tree, plan.children) if plan.edges else ()
     branches = _branches(problem, tree, plan.children) if plan.branches else ()
-    roots, edges, branches = jax.tree.map(
-        lambda a: a[:, : len(group)], jax.device_get((roots, edges, branches))
+    roots, edges, branches = index_tree(
+        jax.device_get((roots, edges, branches)), np.s_[:, : len(group)]
     )
     return TreeBatch(
         log=log,

@@ -20,7 +20,7 @@ from jast._src.search.tree.layout import (
 from jast._src.search.tree.packing import pack
 from jast._src.search.tree.pages import back_up, fills
 from jast._src.search.tree.select import walk_down
-from jast._src.util.pytrees import select
+from jast._src.util.pytrees import index_tree, select
 
 __all__ = ["child_state", "grow", "replay_to"]
 
@@ -162,7 +162,7 @@ def replay_to(problem, axes, tree, trail, depth, memoize, lane=None, live=None):
         lane = jnp.arange(tree.key.shape[0], dtype=jnp.int32)
     else:
         problem = of_lanes(problem, axes, lane)
-        start = jax.tree.map(lambda a: a[lane], start)
+        start = index_tree(start, lane)
     key, base, first = start
     move = jax.vmap(child_state, in_axes=(axes, *[0] * 7))
 

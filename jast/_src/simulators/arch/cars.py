@@ -26,6 +26,8 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
+from jast._src.util.pytrees import index_tree
+
 __all__ = ["DT", "DURATION", "INPUTS", "Cars", "drive", "observe", "start"]
 
 DT = 0.05
@@ -104,7 +106,7 @@ def drive(cars: Cars, inputs: jax.Array) -> tuple[Cars, Cars]:
         modes.append(mode)
     gaps, speeds, modes = (jnp.stack(columns, axis=-1) for columns in (gaps, speeds, modes))
     samples = Cars(gaps, speeds, modes, first)
-    return jax.tree.map(lambda a: a[-1], samples), samples
+    return index_tree(samples, -1), samples
 
 
 def observe(cars: Cars) -> tuple[Any, ...]:
