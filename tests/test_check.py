@@ -554,3 +554,46 @@ def test_a_start_that_was_not_given_is_named():
     sim = dataclasses.replace(line(), init=lambda x0: x0 + 0.0)
     with pytest.raises(ValueError, match=r"init: raised TypeError.*as start is not given"):
         jast.check(sim)
+
+
+def boxed(**functions):
+    """A walk whose state is a dictionary."""
+    given = dict(
+        init=lambda x0: {"at": jnp.zeros(())},
+        step=lambda s, x: {"at": 0.5 * s["at"] + 0.3 * x},
+        disturbance=lambda s: D.Normal(0.0, 1.0),
+        evaluate=lambda s: (s["at"] > 3, jnp.maximum(3 - s["at"], 0.0)),
+        horizon=8,
+    )
+    return jast.Simulator(**(given | functions))
+
+
+def far(s):
+    s["at"] = 2 * s["at"]
+    return s["at"] > 3, jnp.maximum(3 - s["at"], 0.0)
+
+
+def emptied(s):
+    s.pop("at")
+    return D.Normal(0.0, 1.0)
+
+
+@pytest.mark.parametrize(("name", "function"), [("evaluate", far), ("disturbance", emptied)])
+def test_functions_leave_the_state_as_it_is(key, name, function):
+    sim = boxed(**{name: function})
+    for call in (jast.check, lambda sim: jast.nominal(key, sim, episodes=10)):
+        with pytest.raises(ValueError, match=f"^{name}: changes the state"):
+            call(sim)
+
+
+def test_a_step_may_change_its_own_state():
+    def step(s, x):
+        s["at"] = 0.5 * s["at"] + 0.3 * x
+        return s
+
+    shared = {"at": jnp.zeros(())}
+    sim = jast.check(boxed(step=step, init=lambda x0: shared))
+    x = jnp.full(8, 2.0)
+    states = [jast.replay(a, x).states["at"] for a in (sim, boxed())]
+    np.testing.assert_array_equal(*states)
+    assert shared == {"at": 0.0}

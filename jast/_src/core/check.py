@@ -9,6 +9,7 @@ disturbance. Then come the `core.traps`.
 from __future__ import annotations
 
 import math
+import operator
 import warnings
 from typing import NamedTuple
 
@@ -121,7 +122,7 @@ def check(sim: Simulator, actions: Actions | None = None) -> Simulator:
             raise ValueError(
                 f"evaluate: {incident.message}: randomness belongs in disturbance or start{ANEW}"
             )
-    _check_twice("step", lambda x0, x: sim.step(sim.init(x0), x), found.x0, found.x)
+    _check_twice("step", lambda x0, x: sim.step(first_state(sim, x0), x), found.x0, found.x)
     for words in traps(sim):
         warnings.warn(f"check: {words}", UserWarning, stacklevel=2)
     warn_of_lost_failures(sim)
@@ -200,14 +201,22 @@ def _trace(function, sim, actions, observed):
 
 
 def _call(name, function, *args):
+    # containers of its own: what a step does to these is its own affair
+    given = jax.tree.map(lambda a: a, args)
     try:
-        found = function(*args)
+        found = function(*given)
     except Exception as e:
         from jast._src.blackbox.worker import line_of
 
         kind = type(e).__name__
         hint = HINTS.get(kind, NO_START if name == "init" and args == ((),) else "")
         raise ValueError(f"{name}: raised {kind}{line_of(e)}: {_first_line(e)}{hint}") from e
+    kept = jax.tree.leaves(args), jax.tree.leaves(given)
+    if name != "step" and (len(kept[0]) != len(kept[1]) or any(map(operator.is_not, *kept))):
+        raise ValueError(
+            f"{name}: changes the state that it is given, which others look at, too: it must leave"
+            " it as it is, and make a new one, such as {**state, 'speed': 0.0}, where it needs one"
+        )
     if found is None and name in ("init", "step"):
         raise ValueError(f"{name}: returned None: is a return missing?")
     return found
