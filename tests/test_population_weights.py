@@ -2,6 +2,7 @@
 and populations check it.
 """
 
+import math
 import sys
 
 import jax
@@ -189,3 +190,25 @@ def test_sensitivities_are_told_by_what_drew(beta, drawn, key):
     truth = 20**0.5 * stats.norm.pdf(beta) / stats.norm.sf(beta)
     row = next(r for r in told.rows if r[1] == 0)
     assert told.reliable and abs(row[2] - truth) < 4 * row[3] < 0.1 * truth
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("budget", [50_000, 1_000_000])
+def test_choices_are_weighted_where_populations_can_check_it(key, budget):
+    """A chain of four states whose miss distance says nothing. What a population of few points did
+    not meet of its choices the Gaussians that were fitted to it leave out.
+    """
+    steps = np.array([[0.97, 0.03, 0, 0], [0.6, 0.37, 0.03, 0], [0.2, 0.5, 0.27, 0.03]])
+    p = jnp.maximum(jnp.asarray([*steps, [0, 0, 0, 1]], jnp.float32), 1e-30)
+    chain = jast.Simulator(
+        init=lambda x0: jnp.zeros((), jnp.int32),
+        step=lambda s, x: x.astype(jnp.int32),
+        disturbance=lambda s: D.Categorical(probs=p[s]),
+        evaluate=lambda s: (s >= 3, jnp.where(s >= 3, 0.0, 1.0)),
+        horizon=10,
+    )
+    found = population(key, chain, budget)
+    truth = np.linalg.matrix_power([*steps, [0, 0, 0, 1]], 10)[0, 3]
+    assert ("importance" in found.method) == (budget == 1_000_000)
+    # within 4 standard errors, as is one of 15,000 by chance
+    assert abs(found.log_mean - math.log(truth)) < 4 * found.relative_error

@@ -12,9 +12,11 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from jast._src.core.counter_prng import numpy_generator
+from jast._src.core.signature import signature_of
 from jast._src.estimate.diagnostics import tail_size
 from jast._src.estimate.estimate import Estimate
 from jast._src.estimate.gaussians.family import defensive_parts
@@ -32,6 +34,12 @@ __all__ = ["gaussians_promise_more", "importance_estimate"]
 
 TARGET_ERROR = 0.005
 """Relative standard error at which it ends: no population checks a smaller one."""
+MAX_CHECK_ERROR = 0.15
+"""Relative standard error of the populations above which they check no importance sampling where
+some of the disturbances are choices or counts: to what of these was not met no Gaussian is near. Of
+coins beside normal numbers, counts and a Markov chain with 50,000 and 100,000 evaluations, whose
+populations are mostly above it, 6 of 86 reliable answers were more than 3 standard errors too low,
+by a tenth; with 300,000, where they are mostly below, 1 of 70."""
 MAX_PRODUCTS = 5e10
 """Products that the densities of a proposal may cost: some five seconds of a core."""
 MAX_COMPONENTS = 16
@@ -65,7 +73,7 @@ def importance_estimate(
     promise as much with what is left of the budget, and where its own weights speak against it.
     """
     left = (search.budget - search.spent) * PILOT_DIVISOR // (PILOT_DIVISOR + 1)
-    if left < BLOCK:
+    if left < BLOCK or not _is_checked(search, kinds):
         return None
     best = _best_proposal(search, kinds, left)
     by_populations = search.answer(kinds[0]).relative  # and what they promise with the rest
@@ -87,6 +95,15 @@ def importance_estimate(
         reason = "; ".join(found.warnings)
     search.history.append(f"which is not used: {reason}")
     return None
+
+
+def _is_checked(search, kinds):
+    """Whether the populations of ``kinds`` would see what a proposal leaves out."""
+    signature = signature_of(search.sim)
+    numbers = jax.tree.leaves((signature.x0, signature.x))
+    if all(jnp.issubdtype(s.dtype, jnp.floating) for s in numbers):
+        return True
+    return pool_answers([search.answer(k) for k in kinds]).relative <= MAX_CHECK_ERROR
 
 
 def gaussians_promise_more(search: PopulationSearch) -> bool:
