@@ -26,6 +26,7 @@ from jast._src.estimate.population.particle_moves import (
     Particles,
     Steering,
     allocate_particles,
+    draw_particles,
     initial_steering,
     move_particles,
     record_crossings,
@@ -299,6 +300,52 @@ def latch():
     )
 
 
+def lossy(limit):
+    """Six normal numbers, of which each is lost in .2 of all; a sum at the ``limit`` fails."""
+    return jast.Simulator(
+        init=lambda x0: jnp.zeros(()),
+        step=lambda s, x: s + jnp.where(x[1] > 0, 0.0, x[0]),
+        disturbance=lambda s: D.Joint((D.Normal(0.0, 1.0), D.Bernoulli(probs=0.2))),
+        evaluate=lambda s: (s >= limit, jnp.maximum(limit - s, 0.0)),
+        horizon=6,
+        episodic=True,
+    )
+
+
+def lossy_probability(limit):
+    """By the number of those that arrive."""
+    arrive = np.arange(1, 7)
+    return stats.binom(6, 0.8).pmf(arrive) @ norm.sf(limit / arrive**0.5)
+
+
+def alarms():
+    """Six alarms of .02, beside normal numbers that decide nothing; four of them fail."""
+    return jast.Simulator(
+        init=lambda x0: jnp.zeros(()),
+        step=lambda s, x: s + x[1].astype(s.dtype),
+        disturbance=lambda s: D.Joint((D.Normal(0.0, 1.0), D.Bernoulli(probs=0.02))),
+        evaluate=lambda s: (s >= 4, jnp.maximum(4.0 - s, 0.0)),
+        horizon=6,
+        episodic=True,
+    )
+
+
+@pytest.mark.parametrize("sim, widened", [(lossy(7.5), [True, False]), (alarms(), [True, True])])
+def test_choices_are_widened_only_where_failures_need_it(key, sim, widened, monkeypatch):
+    """Numbers that are lost have to be larger, whatever is lost; alarms have to be more."""
+    seen = []
+
+    def drawn(*args, wide, width):
+        seen.append((width, wide))
+        return draw_particles(*args, wide=wide, width=width)
+
+    monkeypatch.setattr(descents, "draw_particles", drawn)
+    DESCENTS["width"](key, sim, N, 2, N)
+    width, wide = seen[-1]
+    assert width > 1
+    np.testing.assert_array_equal(wide, np.tile(widened, 6))
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("way", ["distance", "width"])
 @pytest.mark.parametrize(
@@ -308,11 +355,13 @@ def latch():
         (start_and_steps(), norm.sf(9 / 8**0.5)),
         (wheel(), turned()),
         (latch(), (1 - norm.cdf(3) ** 5) * norm.sf(1.5)),
+        (lossy(7.5), lossy_probability(7.5)),
+        (alarms(), stats.binom(6, 0.02).sf(3)),
     ],
-    ids=["sphere", "start", "wheel", "latch"],
+    ids=["sphere", "start", "wheel", "latch", "lossy", "alarms"],
 )
 def test_chains_tell_closed_forms(key, way, sim, truth):
-    """1.4e-4, 7.3e-4, 1.5e-4 and 4.5e-4, from four populations."""
+    """1.4e-4, 7.3e-4, 1.5e-4, 4.5e-4, 4.7e-4 and 2.3e-6, from four populations."""
     runs = [DESCENTS[way](k, sim, N, 10, N) for k in jax.random.split(key, 4)]
     a = answer_of(runs)
     assert abs(a.log_mean - np.log(truth)) < 4 * a.relative < 4 * search.MAX_WITNESS_ERROR

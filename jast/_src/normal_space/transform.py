@@ -59,6 +59,7 @@ __all__ = [
     "policy_of",
     "side_by_side",
     "simulate",
+    "smooth_numbers",
     "split_point",
     "used_numbers",
     "unit",
@@ -177,6 +178,18 @@ def simulate(
     start = with_rows_of(z, (begun, none, look(begun, none, seen)))
     end, length, seen = lax.while_loop(lambda c: ~c[0].done, body, start)
     return conclude(sim, reward, end), length, seen
+
+
+def smooth_numbers(sim: Simulator) -> np.ndarray:
+    """Which of the numbers [D] make a float; the others make choices and counts."""
+
+    def of(tree):
+        each = [(count_numbers(s), jnp.issubdtype(s.dtype, jnp.floating)) for s in tree]
+        return [is_float for n, is_float in each for _ in range(n)]
+
+    like = signature_of(sim)
+    start, step = (of(jax.tree.leaves(tree)) for tree in (like.x0, like.x))
+    return np.array(start + sim.horizon * step, bool)
 
 
 def unit(z: np.ndarray) -> np.ndarray:

@@ -29,7 +29,7 @@ from jast._src.estimate.population.particle_moves import (
     record_crossings,
 )
 from jast._src.estimate.proposal_search.mixture_draws import resample
-from jast._src.normal_space.transform import dimension
+from jast._src.normal_space.transform import dimension, smooth_numbers
 from jast._src.runtime.device import BLOCK, on_cpu
 
 __all__ = [
@@ -132,6 +132,7 @@ class _ParticlePopulation:
         # else the distance is known at the end of an episode, and nothing comes after it
         self.watched = not sim.episodic and sim.horizon > 1
         self.plain, self.levels = (0, 0, 0), []
+        self.wide = np.ones(dimension(sim), bool)  # the numbers that a width is of
 
     def next_key(self):
         self.calls += 1
@@ -140,7 +141,9 @@ class _ParticlePopulation:
     def draw(self, width):
         """Begin with independent points of this width; returns which of them fail."""
         key = self.next_key()
-        self.particles, invalid = draw_particles(self.sim, self.particles, key, self.n, width=width)
+        self.particles, invalid = draw_particles(
+            self.sim, self.particles, key, self.n, width=width, wide=self.wide
+        )
         self.evaluations += self.n
         self.invalid += invalid
         failing = self.score() == -np.inf
@@ -183,6 +186,7 @@ class _ParticlePopulation:
             moves=self.moves,
             level=level,
             kinds=kinds,
+            wide=self.wide,
             **width,
         )
         self.evaluations += self.moves * self.n
@@ -282,7 +286,7 @@ def by_width(
     levels = population.levels
     levels.append(width)
     if width > 1:
-        steps = _expected_steps(dimension(sim), width, settings)
+        steps = _expected_steps(int(population.wide.sum()), width, settings)
         failing = population.keep_first(failing, max_evaluations / (moves * steps))
     if failing.sum() < 2:
         return population.without_failures()
@@ -292,7 +296,9 @@ def by_width(
         population.multiply(log_w)
         population.resample_and_move(log_w, -np.inf, width=width, before=before)
         p = population.particles
-        square, used = (np.asarray(a, np.float64)[: population.n] for a in (p.square, p.used))
+        square, used = (np.asarray(a)[: population.n] for a in (p.square, p.used))
+        square = square.astype(np.float64)
+        used = np.concatenate([[0], np.cumsum(population.wide)])[used].astype(np.float64)
         before, width = width, _next_width(square, used, width, settings.effective_share)
         log_w = _log_density_ratio(square, used, before, width)
         levels.append(width)
@@ -304,16 +310,20 @@ def by_width(
 
 def _find_width(population, settings):
     """The least width at which failures are frequent, or else where they are least rare; and which
-    of its points, drawn, fail.
+    of its points, drawn, fail. Choices and counts stay as the model has them where failures are
+    frequent all the same: the way back is shorter, and leads through fewer regimes.
     """
-    shares = []
+    everything, smooth = population.wide, smooth_numbers(population.sim)
+    mixed, tried = smooth.any() and not smooth.all(), []
     for width in settings.widths:
-        failing = population.draw(width)
-        shares.append(failing.mean())
-        if shares[-1] >= settings.failing_share:
-            return width, failing
-    best = settings.widths[int(np.argmax(shares))]
-    return best, failing if best == width else population.draw(best)
+        for population.wide in [smooth, everything] if mixed and width > 1 else [everything]:
+            failing = population.draw(width)
+            tried.append((failing.mean(), width, population.wide))
+            if failing.mean() >= settings.failing_share:
+                return width, failing
+    best = max(tried, key=lambda one: one[0])
+    _, width, population.wide = best
+    return width, failing if best is tried[-1] else population.draw(width)
 
 
 def _expected_steps(d, width, settings):

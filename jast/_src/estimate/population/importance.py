@@ -12,11 +12,9 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from jast._src.core.counter_prng import numpy_generator
-from jast._src.core.signature import signature_of
 from jast._src.estimate.diagnostics import tail_size
 from jast._src.estimate.estimate import Estimate
 from jast._src.estimate.gaussians.family import defensive_parts
@@ -26,7 +24,7 @@ from jast._src.estimate.population.failure_sample import sample_from
 from jast._src.estimate.population.search import Answer, Kind, PopulationSearch, pool_answers
 from jast._src.estimate.proposal_search.final_draws import draw_estimate
 from jast._src.estimate.proposal_search.mixture_draws import log_ratio
-from jast._src.normal_space.transform import Latent, dimension, normal_numbers
+from jast._src.normal_space.transform import Latent, dimension, normal_numbers, smooth_numbers
 from jast._src.runtime.device import BLOCK
 from jast._src.runtime.progress_bar import Watch
 
@@ -99,9 +97,7 @@ def importance_estimate(
 
 def _is_checked(search, kinds):
     """Whether the populations of ``kinds`` would see what a proposal leaves out."""
-    signature = signature_of(search.sim)
-    numbers = jax.tree.leaves((signature.x0, signature.x))
-    if all(jnp.issubdtype(s.dtype, jnp.floating) for s in numbers):
+    if smooth_numbers(search.sim).all():
         return True
     return pool_answers([search.answer(k) for k in kinds]).relative <= MAX_CHECK_ERROR
 

@@ -59,7 +59,7 @@ class Particles(NamedTuple):
     used: jax.Array
     """[n] int32: how many of the numbers decided the episode"""
     square: jax.Array
-    """[n] sum of the squares of these"""
+    """[n] sum of the squares of those of these that the width is of"""
     distance: jax.Array
     """[n] miss distance, of failures too"""
     reached: jax.Array
@@ -98,15 +98,20 @@ def allocate_particles(sim: Simulator, n: int) -> Particles:
 
 
 def draw_particles(
-    sim: Simulator, particles: Particles, key: jax.Array, n: int, width: float = 1.0
+    sim: Simulator,
+    particles: Particles,
+    key: jax.Array,
+    n: int,
+    width: float = 1.0,
+    wide: np.ndarray | None = None,
 ) -> tuple[Particles, int]:
     """``n`` new independent points of N(0, width^2 I) in the place of ``particles``, and how many
-    of their episodes are invalid.
+    of their episodes are invalid; ``wide``: see `move_particles`.
     """
     rows = np.arange(n, dtype=np.int32)
     steering = Steering(np.ones(2, np.float32), np.zeros(2, np.float32))
     after, _, invalid = move_particles(
-        sim, particles, key, rows, steering, moves=1, level=np.inf, width=width
+        sim, particles, key, rows, steering, moves=1, level=np.inf, width=width, wide=wide
     )
     return after, invalid
 
@@ -134,6 +139,7 @@ def move_particles(
     level: float,
     width: float = 1.0,
     before: float | None = None,
+    wide: np.ndarray | None = None,
     kinds: tuple[int, int] = (SMALL, WINDOW),
 ) -> tuple[Particles, Steering, int]:
     """The points of ``rows`` [m] after so many moves that keep N(0, width^2 I) given a score of at
@@ -141,23 +147,27 @@ def move_particles(
     stands in the other places means nothing.
 
     ``before``: the width that the points were drawn with, where it was another one. Numbers that an
-    episode did not use are scaled to the new one, as nothing ties them. ``kinds``: of the moves,
-    which alternate.
+    episode did not use are scaled to the new one, as nothing ties them. ``wide`` [D], bool: the
+    numbers that have this width; the others have that of the model. Default: all. ``kinds``: of
+    the moves, which alternate.
     """
     dtype, live = np.dtype(particles.z.dtype), len(rows)
     places = np.arange(len(particles.z), dtype=np.int32)
     places[:live] = rows
     ratio = 1.0 if before is None else width / before
     counts = np.int32(live), np.int32(moves), np.array(kinds, np.int32)
+    wide = np.ones(dimension(sim), bool) if wide is None else wide
     numbers = (dtype.type(v) for v in (level, width, ratio))
     out, size, accepted, invalid = _move_on_device(
-        sim, particles, key, places, steering.size, *counts, *numbers
+        sim, particles, key, places, steering.size, wide, *counts, *numbers
     )
     return out, Steering(np.asarray(size), np.asarray(accepted)), int(invalid)
 
 
 @partial(jax.jit, donate_argnums=1)
-def _move_on_device(sim, particles, key, rows, size, live, moves, kinds, level, width, ratio):
+def _move_on_device(sim, particles, key, rows, size, wide, live, moves, kinds, level, width, ratio):
+    wide = wide[None]
+    width, ratio = (jnp.where(wide, a, 1) for a in (width, ratio))
     n, d = particles.z.shape
     lanes = block_size(n)
     play = jax.vmap(lambda z: outcome_by_level(sim, z, level))
@@ -193,7 +203,7 @@ def _move_on_device(sim, particles, key, rows, size, live, moves, kinds, level, 
             z=z,
             score=score,
             used=o.used,
-            square=jnp.sum(jnp.where(number < o.used[:, None], z**2, 0), axis=1),
+            square=jnp.sum(jnp.where(wide & (number < o.used[:, None]), z**2, 0), axis=1),
             distance=o.distance.astype(score.dtype),
             reached=reached,
         )
