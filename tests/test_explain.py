@@ -177,6 +177,23 @@ def test_a_regression_is_where_the_new_version_alone_fails():
     jast.check(both)
 
 
+@pytest.mark.parametrize("disturbance", [Normal(0.0, 1.0), None], ids=["normal", "seeds"])
+def test_functions_in_python_that_both_fail_are_valid(key, disturbance):
+    def version(limit):
+        return jast.blackbox.from_python(
+            lambda x: (bool(x.sum() > limit), float(max(limit - x.sum(), 0.0))),
+            horizon=2,
+            disturbance=disturbance,
+        )
+
+    sims = (version(1.0), version(0.5)) if disturbance else (version(2.0**32), version(2.0**31))
+    both = explain.regression(*sims)
+    e = jast.replay(both, jnp.full(2, 2**31 + 1, jnp.uint32 if disturbance is None else float))
+    assert not bool(e.failure) and 0 < float(e.distance) < np.inf
+    found = jast.nominal(key, both, episodes=50)
+    assert found.invalid == 0 and found.failing > 0
+
+
 @pytest.mark.long
 def test_the_likeliest_regression_and_its_probability(key):
     """P = Phi(-4.7534) = 1e-6 on the branch that regressed; the likeliest costs 4.7534^2 / 2. The
