@@ -154,6 +154,27 @@ def test_check_says_where_an_object_does_not_start_anew(episodic):
     assert jast.check(box(blackboxes.Walk, 5, episodic=episodic))
 
 
+class Raises(blackboxes.Walk):
+    def transition(self, x):
+        raise KeyError("a")
+
+
+class Mute(blackboxes.Walk):
+    """Knows no distance."""
+
+    def miss_distance(self):
+        return None
+
+
+@pytest.mark.parametrize(
+    "system, words",
+    [(Mute, "init: .*at the start, .*\n.*received None"), (Raises, "step: .*\n.*KeyError: 'a'")],
+)
+def test_check_says_what_an_object_raised(system, words):
+    with pytest.raises(ValueError, match=words):
+        jast.check(box(system, 2))
+
+
 def test_what_is_observed_may_be_chosen_from_more():
     sim = jast.check(box(Looks, 3, observe=lambda s: s.seen[5:7]))
     assert sim.observe(sim.step(sim.init(()), jnp.ones(()))).tolist() == [6, 7]

@@ -428,10 +428,9 @@ def _check_numbers(found, went_wrong):
     leaves = jax.tree_util.tree_leaves_with_path(found.state)
     steps = [(first_wrong(flags), path) for path, flags in leaves]
     for t, path in sorted([s for s in steps if s[0] is not None], key=lambda s: s[0])[:1]:
-        raise ValueError(
-            f"{'init' if t == 0 else 'step'}: state leaf {_path(path)} is NaN"
-            f" {f'after {t} steps' if t else 'at the start'}, expected a number"
-        )
+        said = f"{'step' if t else 'init'}: state leaf {_path(path)} is NaN"
+        said += f" {f'after {t} steps' if t else 'at the start'}, expected a number"
+        raise ValueError("\n  ".join([said, *map(str, went_wrong)]))
     if (t := first_wrong(found.distance)) is not None:
         said = f"evaluate: distance is not finite after {t} steps, expected a number"
         raise ValueError("\n  ".join([said, *map(str, went_wrong)]))
