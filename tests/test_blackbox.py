@@ -5,6 +5,7 @@ in which a system can go wrong.
 import os
 import re
 import sys
+import time
 
 import blackboxes
 import jax
@@ -467,6 +468,17 @@ def test_an_external_program():
     assert "exit status 1: no good" in raised.message
     assert answered.kind == "wrong answer"
     assert "received 'no answer'" in answered.message
+
+
+@pytest.mark.skipif(os.name != "posix", reason="elsewhere it is waited for")
+def test_a_program_is_not_waited_for_beyond_its_end():
+    """A child keeps its outputs, of which a pipe holds a tenth."""
+    much = "import sys; [f.write('x' * 10**6 + '\\n') for f in (sys.stdout, sys.stderr)]"
+    answer = """echo '{"event": false, "distance": 2.5}'"""
+    text = f'sleep 30 & {sys.executable} -c "{much}"; {answer}'
+    started = time.monotonic()
+    assert blackbox.program(["sh", "-c", text])(np.zeros(2)) == (False, 2.5)
+    assert time.monotonic() - started < 20
 
 
 def test_a_gymnasium_environment():

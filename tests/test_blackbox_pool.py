@@ -4,6 +4,7 @@ process outlives its simulator.
 
 import gc
 import os
+import subprocess
 import sys
 import threading
 import time
@@ -209,12 +210,34 @@ def test_a_program_is_ended_with_its_children():
     assert np.isnan(ends(sim, [0.0]))
     (only,) = incidents(sim)
     assert only.kind == "timed out"
-    running = [
-        pid
-        for pid in os.listdir("/proc")
-        if pid.isdigit() and f"60.{mark[-6:]}".encode() in _command(pid)
-    ]
-    assert gone(running)
+    assert gone(having(f"60.{mark[-6:]}"))
+
+
+RUNS = """
+import sys, jax, jast
+run = jast.blackbox.program(["sh", "-c", f"sleep {sys.argv[1]} & wait"])
+normal = jast.distributions.Normal(0.0, 1.0)
+sim = jast.blackbox.from_python(run, horizon=1, disturbance=normal, workers=1)
+jast.rollout(jax.random.key(0), sim)
+"""
+
+
+@pytest.mark.slow
+def test_a_program_is_ended_where_the_process_that_asks_is_killed():
+    mark = f"{time.time():.6f}"
+    command = f"61.{mark[-6:]}"
+    with subprocess.Popen([sys.executable, "-c", RUNS, command]) as asks:
+        deadline = time.monotonic() + 60
+        while not (pids := having(f"sleep\0{command}")) and time.monotonic() < deadline:
+            time.sleep(0.1)
+        asks.kill()
+    assert pids and gone(pids)
+
+
+def having(text):
+    """The processes with ``text`` in their command."""
+    pids = filter(str.isdigit, os.listdir("/proc"))
+    return [pid for pid in pids if text.encode() in _command(pid)]
 
 
 def _command(pid):

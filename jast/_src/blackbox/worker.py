@@ -27,6 +27,7 @@ __all__ = [
     "Spec",
     "WrongAnswer",
     "blank",
+    "end_group",
     "fill",
     "history",
     "install",
@@ -457,8 +458,10 @@ def install(system, spec):
     if hasattr(signal, "SIGINT"):
         # a search that is interrupted ends its workers itself
         signal.signal(signal.SIGINT, signal.SIG_IGN)
-    threading.Thread(target=_end_with, args=(os.getppid(),), daemon=True).start()
     module = types.ModuleType(NAME)
+    module.running = set()  # processes of external programs
+    args = os.getppid(), module.running
+    threading.Thread(target=_end_with, args=args, daemon=True).start()
     module.runner = runner = Runner(system, spec)
     # a plain tuple: the class would travel with it
     module.serve = lambda *rows: tuple(runner(*rows))
@@ -466,8 +469,20 @@ def install(system, spec):
     sys.modules[NAME] = module
 
 
-def _end_with(parent):
-    """End this process once ``parent`` has: one that was killed could not end its workers."""
+def _end_with(parent, running):
+    """End this process, and first what it runs, once ``parent`` has: one that was killed could not
+    end its workers.
+    """
     while os.getppid() == parent:
         time.sleep(1)
+    for process in list(running):
+        end_group(process)
     os._exit(1)
+
+
+def end_group(process):
+    """End a process that leads a session, with what it has started."""
+    try:
+        os.killpg(process.pid, signal.SIGKILL)
+    except (AttributeError, OSError):  # no sessions on this system, or it has just ended
+        process.kill()
