@@ -2,11 +2,8 @@
 raised, so that a search goes on.
 """
 
-from jast._src.runtime.host_errors import (
-    KINDS,
-    Incident,
-    incidents,
-)
+from jast._src.blackbox.incidents import incidents
+from jast._src.runtime.host_errors import KINDS, Incident
 from jast._src.util.doors import dir_function
 
 __all__ = [

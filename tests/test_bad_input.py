@@ -65,6 +65,7 @@ def swept(values, *args, **options):
             lambda key: jast.explain.minimal(walk1d(horizon=5), jast.rollout(key, SIM)),
             "minimal: disturbances of episode",
         ),
+        (lambda key: jast.incidents.incidents(None), "incidents: sim must be a jast.Simulator"),
         (lambda key: jast.explain.cards(key, SIM, None), "modes must be .*, received NoneType"),
         (lambda key: jast.explain.cards(key, SIM, [3]), "modes must be .*, received list"),
     ],

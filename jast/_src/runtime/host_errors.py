@@ -198,19 +198,9 @@ def in_full_batches(sim, least):
     return -(-least // workers) * workers
 
 
-def incidents(sim: Simulator) -> tuple[Incident, ...]:
-    """What has gone wrong so far in the host code behind a simulator, by kind and message.
-
-    Args:
-        sim: the simulator.
-
-    Returns:
-        A tuple of `Incident`; ``()`` for a simulator in JAX.
-
-    Example:
-        >>> import jast
-        >>> jast.incidents.incidents(jast.simulators.walk1d())
-        ()
+def incidents(sim):
+    """What has gone wrong so far, `Incident`, in the host code of a simulator, or of what holds
+    one.
     """
     return tuple(i for host in hosts_of(sim) for i in host.log.all())
 

@@ -1,0 +1,29 @@
+"""incidents: what went wrong in the host code behind a simulator."""
+
+from __future__ import annotations
+
+from jast._src.core.simulator import Simulator, require_simulator
+from jast._src.runtime import host_errors
+
+__all__ = ["incidents"]
+
+
+def incidents(sim: Simulator) -> tuple[host_errors.Incident, ...]:
+    """What has gone wrong so far in the host code behind a simulator, by kind and message.
+
+    Args:
+        sim: the simulator.
+
+    Returns:
+        A tuple of `Incident`; ``()`` for a simulator in JAX.
+
+    Raises:
+        ValueError: for what is no simulator.
+
+    Example:
+        >>> import jast
+        >>> jast.incidents.incidents(jast.simulators.walk1d())
+        ()
+    """
+    require_simulator("incidents", sim)
+    return host_errors.incidents(sim)
