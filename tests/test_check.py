@@ -460,9 +460,9 @@ def test_nominal_counts_invalid_episodes(key):
     assert found.mean_distance == pytest.approx(5)
     assert found.failing == 0
     with pytest.warns(UserWarning, match="of 5 nominal"):
-        assert np.isnan(
-            jast.nominal(key, line(step=lambda s, x: s * jnp.nan), episodes=5).mean_distance
-        )
+        found = jast.nominal(key, line(step=lambda s, x: s * jnp.nan), episodes=5)
+    assert np.isnan(found.mean_distance) and np.isnan(found.rate) and found.interval == (0, 1)
+    assert "5, all: nothing is known" in str(found)
 
 
 def test_nominal_of_seeds_has_no_undisturbed_episode(key):

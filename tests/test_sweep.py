@@ -126,6 +126,10 @@ def test_a_row_of_nan_is_one_row(key):
         table = crude(key, (0.5, math.nan))
     assert table.results[1].failing == 0 or table.results[1].invalid
     assert table.results[0].failing > 0
+    searched = jast.sweep(key, make, {"limit": [math.nan]}, jast.search.monte_carlo, episodes=50)
+    estimated = jast.sweep(key, make, {"limit": [math.nan, 0.5]}, budget=60)
+    assert "all 50 episodes are invalid" in str(searched)
+    assert str(estimated).count("episodes are invalid: nothing is known") == 1
 
 
 def test_a_file_gives_a_sweep_back(key, tmp_path, equal):

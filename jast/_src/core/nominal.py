@@ -34,7 +34,7 @@ from jast._src.util.checks import check_random_key, whole_number
 from jast._src.util.intervals import clopper_pearson
 from jast._src.util.pytrees import with_rows_of, zero_where
 
-__all__ = ["BRIEF", "Nominal", "describe_undisturbed", "nominal", "outcome"]
+__all__ = ["BRIEF", "Nominal", "describe_undisturbed", "nominal", "outcome", "rate_of"]
 
 BRIEF = 4096
 """Episodes up to which the program is compiled quickly, as it runs briefly: on the ferry and three
@@ -59,9 +59,9 @@ class Nominal(NamedTuple):
     episodes: int
     """Episodes simulated."""
     rate: float
-    """failing / episodes."""
+    """failing / episodes; NaN where all are invalid."""
     interval: tuple[float, float]
-    """95 % Clopper-Pearson interval of the failure probability."""
+    """95 % Clopper-Pearson interval of the failure probability; (0, 1) where all are invalid."""
     mean_distance: float
     """Mean miss distance over the valid episodes; NaN where there are none."""
     invalid: int
@@ -89,7 +89,7 @@ class Nominal(NamedTuple):
             ("failures", f"{self.failing} of {self.episodes} episodes"),
             ("rate", f"{self.rate:.4g}   95 % [{low:.4g}, {high:.4g}]"),
             ("mean distance", f"{self.mean_distance:.4g}"),
-            ("invalid", f"{self.invalid}"),
+            ("invalid", f"{self.invalid}" + ", all: nothing is known" * math.isnan(self.rate)),
         ]
         if "interrupted" in self.settings:
             rows.append(("interrupted", self.settings["interrupted"]))
@@ -184,17 +184,25 @@ def nominal(
             " that is not finite; they count as not failing"
         )
         warnings.warn("\n  ".join([said, *map(str, merge_incidents(*before))]), stacklevel=2)
+    rate, interval = rate_of(failures, invalid, episodes)
     return Nominal(
         undisturbed=quiet,
         failing=failures,
         episodes=episodes,
-        rate=failures / episodes,
-        interval=clopper_pearson(failures, episodes),
+        rate=rate,
+        interval=interval,
         mean_distance=float(mean) if invalid < episodes else math.nan,
         invalid=invalid,
         first=first,
         settings=settings,
     )
+
+
+def rate_of(failing: int, invalid: int, episodes: int) -> tuple[float, tuple[float, float]]:
+    """The rate and the interval of a `Nominal`."""
+    if invalid == episodes:
+        return math.nan, (0.0, 1.0)
+    return failing / episodes, clopper_pearson(failing, episodes)
 
 
 class Job(NamedTuple):

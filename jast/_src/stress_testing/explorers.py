@@ -13,7 +13,7 @@ from jast._src.core.actions import wide
 from jast._src.core.counter_prng import numpy_generator
 from jast._src.core.episode import Episode, replay, rollout
 from jast._src.core.failures import empty
-from jast._src.core.nominal import Nominal
+from jast._src.core.nominal import Nominal, rate_of
 from jast._src.core.policy import undisturbed
 from jast._src.core.rewards import likelihood
 from jast._src.core.signature import signature_of
@@ -30,7 +30,6 @@ from jast._src.search.forest import forest
 from jast._src.search.go_explore.go_explore import go_explore
 from jast._src.search.monte_carlo import monte_carlo
 from jast._src.util.display import call_settings
-from jast._src.util.intervals import clopper_pearson
 from jast._src.util.pytrees import index_tree
 
 __all__ = [
@@ -95,12 +94,13 @@ def nominal_points(key: jax.Array, sim: Simulator, episodes: int) -> tuple[Nomin
         quiet = rollout(key, sim, undisturbed(sim), reward)  # draws nothing
     found, distance = _draw_points(key, sim, episodes)
     valid = episodes - found.invalid
+    rate, interval = rate_of(found.failing, found.invalid, episodes)
     n = Nominal(
         undisturbed=quiet,
         failing=found.failing,
         episodes=episodes,
-        rate=found.failing / episodes,
-        interval=clopper_pearson(found.failing, episodes),
+        rate=rate,
+        interval=interval,
         mean_distance=distance / valid if valid else np.nan,
         invalid=found.invalid,
         settings=call_settings("nominal", key, episodes=episodes),

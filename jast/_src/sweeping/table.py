@@ -281,7 +281,9 @@ def _row(result, error, a):
         cells["episodes"] = f"{episodes}"
     elif not cells:
         cells["result"] = shorten(str(result), CELL, placeholder=" ...")
-    if "probability" in cells and not a.reliable:
+    if none_valid := _invalid(result):
+        cells[NOTE] = f"all {none_valid} episodes are invalid: nothing is known"
+    elif "probability" in cells and not a.reliable:
         cells[NOTE] = _first_warning(result)
     return cells
 
@@ -290,6 +292,17 @@ def _best(result):
     """The best episode of a search or of a report; None of other results."""
     found = result.failures if isinstance(result, Report) else None
     return result.best if isinstance(result, SearchResult) else found.best if found else None
+
+
+def _invalid(result):
+    """How many episodes a result is of, where all of them are invalid; else 0."""
+    estimate = _estimate_of(result)
+    if isinstance(estimate, Estimate) and estimate.plain is not None:
+        _, invalid, n = estimate.plain
+        return n * (invalid == n and math.isnan(estimate.mean))
+    searched = isinstance(result, SearchResult) and not np.isfinite(result.best.reward)
+    counted = isinstance(result, Nominal) and result.invalid == result.episodes
+    return result.invalid if searched or counted else 0
 
 
 def _first_warning(result):

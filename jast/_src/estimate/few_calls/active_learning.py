@@ -135,6 +135,8 @@ def choose_calls(learner: Learner) -> None:
     width = np.where(of_model, 1.0, FIRST_WIDTH)[:, None]
     failing, invalid = learner.call(width * learner.rng.standard_normal((first, learner.dimension)))
     learner.plain = int(failing[of_model].sum()), int(invalid[of_model].sum()), int(of_model.sum())
+    if learner.invalid.all():  # nothing to learn from
+        return
     for i in count():
         learner.fit(i % WARP_EVERY == 0)
         if learner.spent >= calls:
