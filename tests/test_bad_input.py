@@ -65,6 +65,15 @@ def swept(values, *args, **options):
             lambda key: jast.explain.minimal(walk1d(horizon=5), jast.rollout(key, SIM)),
             "minimal: disturbances of episode",
         ),
+        (
+            lambda key: jast.distributions.Bernoulli(probs=1.5),
+            "Bernoulli: probs must lie between 0 and 1, received 1.5",
+        ),
+        (
+            lambda key: jast.distributions.Geometric(np.array([0.5, -0.1])),
+            "Geometric: probs must lie between 0 and 1",
+        ),
+        (lambda key: jast.distributions.Binomial(3.0, jnp.asarray(2.0)), "Binomial: probs must"),
         (lambda key: jast.incidents.incidents(None), "incidents: sim must be a jast.Simulator"),
         (lambda key: jast.explain.cards(key, SIM, None), "modes must be .*, received NoneType"),
         (lambda key: jast.explain.cards(key, SIM, [3]), "modes must be .*, received list"),

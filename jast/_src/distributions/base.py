@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jast._src.core.typing import PRNGKey
+from jast._src.runtime._jax import is_traced
 
 __all__ = [
     "Distribution",
@@ -21,6 +22,7 @@ __all__ = [
     "broadcast",
     "float_array",
     "is_distribution",
+    "probability_array",
     "tree_map",
 ]
 
@@ -173,6 +175,18 @@ def float_array(x: Any) -> Any:
     if jnp.issubdtype(x.dtype, jnp.integer):
         return x.astype(float)
     raise ValueError(f"a distribution's numbers: expected floats or integers, received {x.dtype}")
+
+
+def probability_array(name: str, probs: Any) -> Any:
+    """`float_array` of probabilities of the family ``name``.
+
+    Raises:
+        ValueError: where they are known, and one lies outside of [0, 1].
+    """
+    array, known = float_array(probs), None if is_traced(probs) else np.asarray(probs, float)
+    if known is not None and ((known < 0) | (known > 1)).any():
+        raise ValueError(f"{name}: probs must lie between 0 and 1, received {probs}")
+    return array
 
 
 def _like(d: Distribution) -> Any:

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 
 from jast._src.core.typing import Array, Numeric, PRNGKey
-from jast._src.distributions.base import Distribution, float_array
+from jast._src.distributions.base import Distribution, float_array, probability_array
 
 __all__ = ["Bernoulli", "Categorical"]
 
@@ -60,7 +60,7 @@ class Bernoulli(_Choice):
         dtype: Any = int,
     ) -> None:
         self._check(logits, probs, dtype, jnp.bool_, jnp.integer, jnp.floating)
-        self._probs = None if probs is None else float_array(probs)
+        self._probs = None if probs is None else probability_array(self.name, probs)
         self._logits = None if logits is None else float_array(logits)
 
     @property
