@@ -154,6 +154,10 @@ def test_parameters_are_drawn_once_an_episode(key):
     """x_1 is a uniform pole times a start near 1; and by a pair, by which the limit goes, too."""
     start = (Normal(0.0, 1e-3), lambda state, x: state._replace(x=state.x * 0 + 1.0 + x))
     common = dict(gain=0.0, force=start, failure=lambda now: now.state.x[0] > 1.4)
+    with pytest.raises(ValueError, match="gymnax: parameters: .*received 9.8"):
+        drift(parameters={"pole": 9.8})
+    with pytest.raises(ValueError, match="names must be fields of Params, received 'poles'"):
+        jast.check(drift(parameters={"poles": Uniform(1.0, 1.5)}, **common))
     sim = jast.check(drift(parameters={"pole": Uniform(1.0, 1.5)}, **common))
     within(monte_carlo(key, sim, SAMPLES), 0.2)
     changed = lambda params, x: params._replace(pole=x)

@@ -15,6 +15,13 @@ def made(gain):
     return SIM
 
 
+def judged(key):
+    inputs = np.arange(8.0)[:, None]
+    return jast.weakness.validate(
+        key, lambda x: x[:, 0] > 5, inputs, inputs[:, 0] > 4, budget=4, selector="random"
+    )
+
+
 def swept(values, *args, **options):
     return lambda key: jast.sweep(key, made, values, *args, **options)
 
@@ -74,6 +81,13 @@ def swept(values, *args, **options):
             "Geometric: probs must lie between 0 and 1",
         ),
         (lambda key: jast.distributions.Binomial(3.0, jnp.asarray(2.0)), "Binomial: probs must"),
+        (lambda key: jast.plot.history(3), "plot.history: results must be .*, received int"),
+        (lambda key: jast.plot.history({}, ax="x"), "plot: ax must be Axes of .*, received 'x'"),
+        (lambda key: jast.weakness.idx(None), "idx: path must be that of a file, received None"),
+        (lambda key: jast.weakness.from_idx(None), "from_idx: folder must be .*, received None"),
+        (lambda key: jast.weakness.auc("a", "b"), "auc: scores and failed must be"),
+        (lambda key: jast.weakness.auc([[1.0], 2.0], [True]), "auc: scores and failed must be"),
+        (lambda key: jast.weakness.judge(judged(key), judged(key)), "judge: failed must be bool"),
         (lambda key: jast.incidents.incidents(None), "incidents: sim must be a jast.Simulator"),
         (lambda key: jast.explain.cards(key, SIM, None), "modes must be .*, received NoneType"),
         (lambda key: jast.explain.cards(key, SIM, [3]), "modes must be .*, received list"),

@@ -35,7 +35,10 @@ def random(
     pair = isinstance(value, tuple) and len(value) == 2 and callable(value[1])
     model, apply = value if pair else (value, apply)
     if isinstance(model, dict):  # of names, such as those of agents
-        model = D.Joint({k: _as_one_value(d) for k, d in model.items()})
+        try:
+            model = D.Joint({k: _as_one_value(d) for k, d in model.items()})
+        except ValueError as error:
+            raise ValueError(f"{name}: {place}: {error}") from error
     alone = adds or apply is not None
     if not (D.is_distribution(model) or callable(model)) or not alone:
         expected = f"a distribution, or {PAIR}" if alone else PAIR
@@ -82,6 +85,11 @@ def _sum(argument: str, a: Any, x: Any) -> jax.Array:
 
 def replaced(subject: Any, draw: Any) -> Any:
     """``subject`` with the fields that ``draw`` names."""
+    for k in draw:
+        if not hasattr(subject, k):
+            raise ValueError(
+                f"parameters: names must be fields of {type(subject).__name__}, received {k!r}"
+            )
     like = {k: jnp.asarray(getattr(subject, k)) for k in draw}
     return subject.replace(**{k: jnp.asarray(v, like[k].dtype) for k, v in draw.items()})
 

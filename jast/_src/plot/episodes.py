@@ -47,6 +47,11 @@ def history(
     with style.axes(ax, (6.8, 4.2)) as ax:
         means, bests = [], []
         for i, (name, result) in enumerate(style.by_name(results).items()):
+            if not hasattr(getattr(result, "history", None), "best_reward"):
+                raise ValueError(
+                    "plot.history: results must be a jast.SearchResult, or a dict of name ->"
+                    f" result, received {type(result).__name__}"
+                )
             episodes = np.asarray(result.history.simulations)
             best = np.asarray(result.history.best_reward, float)
             best = np.where(np.isfinite(best), best, np.nan)  # no valid episode yet: not drawn

@@ -111,6 +111,9 @@ def axes(given, size, rows=1, columns=1, *, sharex=True, sharey=False, layout="c
         if given is None:
             shared = dict(sharex=sharex, sharey=sharey)
             given = plt.subplots(rows, columns, figsize=size, layout=layout, **shared)[1]
+        for each in np.ravel(np.asarray(given, object)):
+            if not callable(getattr(each, "get_xlim", None)):
+                raise ValueError(f"plot: ax must be Axes of matplotlib, received {each!r:.80}")
         yield given
 
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 import gzip
 import hashlib
 import math
+import os
 import zlib
 from pathlib import Path
 from typing import NamedTuple
@@ -14,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from jast._src.core.typing import PathLike
-from jast._src.util.checks import import_library, whole_number
+from jast._src.util.checks import check_path, import_library, whole_number
 from jast._src.weakness.result import Result
 
 __all__ = [
@@ -160,6 +161,7 @@ def idx(path: PathLike) -> np.ndarray:
         ...     jast.weakness.idx(path).tolist()
         [7, 9]
     """
+    check_path("idx", path)
     raw = _content(path)
     if len(raw) < 4 or raw[:2] != b"\0\0":
         raise ValueError(
@@ -218,6 +220,8 @@ def from_idx(folder: PathLike, name: str = "t10k") -> tuple[np.ndarray, np.ndarr
         ...     [part.shape for part in jast.weakness.from_idx(folder)]
         [(1, 2, 2), (1,)]
     """
+    if not isinstance(folder, str | os.PathLike):
+        raise ValueError(f"from_idx: folder must be that of the files, received {folder!r:.80}")
     images, labels = (
         _named(folder, f"{name}-{part}", f"idx{dims}-ubyte", dims)
         for part, dims in (("images", 3), ("labels", 1))

@@ -85,7 +85,11 @@ def roc(scores: Array, failed: Array) -> Roc:
         >>> curve.true_positive.tolist()
         [0.0, 0.5, 1.0, 1.0]
     """
-    scores, failed = _check_scores("roc", scores, failed)
+    return _roc("roc", scores, failed)
+
+
+def _roc(function, scores, failed):
+    scores, failed = _check_scores(function, scores, failed)
     order = np.argsort(-scores, kind="stable")
     last = np.flatnonzero(np.append(np.diff(scores[order]) != 0, True)[: len(scores)])
     hits, count = np.cumsum(failed[order])[last], last + 1
@@ -119,7 +123,7 @@ def auc(scores: Array, failed: Array) -> float:
         >>> jast.weakness.auc(np.array([0.9, 0.2, 0.4]), np.array([True, False, True]))
         1.0
     """
-    return roc(scores, failed).area
+    return _roc("auc", scores, failed).area
 
 
 def judge(
@@ -182,7 +186,7 @@ def judge(
 
 def checked_truth(function, failed, n):
     """``failed`` as an array, or a ValueError unless it is bool [n]."""
-    truth = np.asarray(failed)
+    truth = _array(failed)
     if truth.shape != (n,) or truth.dtype != bool:
         raise ValueError(
             f"{function}: failed must be bool [{n}], received {truth.dtype} of shape {truth.shape}"
@@ -199,12 +203,22 @@ def precision_recall(chosen, failed):
 
 
 def _check_scores(function, scores, failed):
-    scores, failed = np.asarray(scores, float), np.asarray(failed)
-    if scores.ndim != 1 or scores.shape != failed.shape or failed.dtype != bool:
+    scores, failed = _array(scores), _array(failed)
+    fits = scores.ndim == 1 and scores.shape == failed.shape
+    if not fits or scores.dtype.kind not in "biuf" or failed.dtype != bool:
         raise ValueError(
-            f"{function}: scores and failed must be [n], failed bool, received {scores.shape} and"
-            f" {failed.dtype} of shape {failed.shape}"
+            f"{function}: scores and failed must be [n], failed bool, received {scores.dtype} of"
+            f" shape {scores.shape} and {failed.dtype} of shape {failed.shape}"
         )
+    scores = scores.astype(float)
     if np.isnan(scores).any():
         raise ValueError(f"{function}: scores must not be NaN, {int(np.isnan(scores).sum())} are")
     return scores, failed
+
+
+def _array(values):
+    """``values`` as an array; of objects where they are none."""
+    try:
+        return np.asarray(values)
+    except ValueError:  # of several shapes
+        return np.asarray(None)
