@@ -82,11 +82,6 @@ def main(argv=None):
                 f"argument --{name}: only of --method {' or '.join(methods)}, not of"
                 f" {options.method}"
             )
-    try:
-        options.output.mkdir(parents=True, exist_ok=True)
-        tempfile.TemporaryFile(dir=options.output).close()  # whether it takes files
-    except OSError as e:
-        parser.error(f"argument --output: {e}")
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):  # no name of a file ends what was found
             stream.reconfigure(errors="replace")
@@ -94,6 +89,7 @@ def main(argv=None):
         if not options.no_cache:
             _keep_programs()
         own = _load(parser, options.system) if options.system else None
+        _make_folder(parser, options.output)
         return _stress(options, own) if options.method == "stress" else _search(options)
     except ValueError as e:
         # a count that the search refuses
@@ -103,6 +99,15 @@ def main(argv=None):
     except KeyboardInterrupt:
         print("\ninterrupted before there was a result", file=sys.stderr)
         return 130
+
+
+def _make_folder(parser, folder):
+    """Make ``folder``; a usage error where that cannot be, or where it takes no files."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        tempfile.TemporaryFile(dir=folder).close()  # whether it takes files
+    except OSError as e:
+        parser.error(f"argument --output: {e}")
 
 
 def _parser():

@@ -1,5 +1,7 @@
 """What no function can use is refused with a ValueError that names the argument and what came."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -81,6 +83,15 @@ def swept(values, *args, **options):
             "Geometric: probs must lie between 0 and 1",
         ),
         (lambda key: jast.distributions.Binomial(3.0, jnp.asarray(2.0)), "Binomial: probs must"),
+        (lambda key: jast.explain.criticality(key, SIM, 3), "criticality: episode cannot be"),
+        (lambda key: jast.explain.differential(key, SIM, 3), "differential: sim must be a"),
+        (lambda key: jast.nominal(key, SIM, devices="cpu"), "devices must be .*received .'cpu'"),
+        (
+            lambda key: jast.blackbox.from_python(
+                lambda x: x, horizon=1, disturbance=jast.distributions.Normal
+            ),
+            r"disturbance must be a distribution, received the class Normal; call it",
+        ),
         (lambda key: jast.plot.history(3), "plot.history: results must be .*, received int"),
         (lambda key: jast.plot.history({}, ax="x"), "plot: ax must be Axes of .*, received 'x'"),
         (lambda key: jast.weakness.idx(None), "idx: path must be that of a file, received None"),
@@ -98,6 +109,17 @@ def test_it_is_named(key, tmp_path, monkeypatch, call, words):
     with pytest.raises(ValueError, match=words):
         call(key)
     assert not list(tmp_path.iterdir())
+
+
+def test_what_is_plainly_meant_is_taken(key):
+    assert type(dataclasses.replace(SIM, horizon=np.int64(3)).horizon) is int
+    answers = iter([0, 1, np.array([True]), 2])
+    sim = jast.blackbox.from_python(
+        lambda x: (next(answers), 1.0), horizon=1, disturbance=jast.distributions.Normal(0.0, 1.0)
+    )
+    found = [jast.replay(sim, jnp.full(1, float(i))) for i in range(4)]
+    assert [bool(e.failure) for e in found] == [False, True, True, False]
+    assert np.isfinite([e.distance for e in found]).tolist() == [True, True, True, False]
 
 
 def test_arrays_and_traced_numbers_are_numbers():

@@ -227,6 +227,7 @@ def test_bad_arguments(capsys, tmp_path, monkeypatch, argv, words):
     with pytest.raises(SystemExit) as end:
         cli.main(argv)
     assert end.value.code == 2 and words in capsys.readouterr().err
+    assert "FILE.py" not in words or not list(tmp_path.iterdir())
 
 
 def test_interrupted_at_once(capsys, tmp_path, monkeypatch):

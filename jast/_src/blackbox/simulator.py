@@ -233,6 +233,11 @@ def from_python(
     )
     size = 0 if run else _observed_numbers(runner, start, limited=observe is None)
 
+    if inspect.isclass(disturbance):
+        raise ValueError(
+            f"{NAME}: disturbance must be a distribution, received the class"
+            f" {disturbance.__name__}; call it, as Normal(0.0, 1.0)"
+        )
     constant = D.is_distribution(disturbance)
     if not (constant or callable(disturbance)):
         raise ValueError(

@@ -395,9 +395,9 @@ def _event(value, name="event"):
     a = _array(value)
     if a.shape == () and a.dtype.kind == "f" and not np.isfinite(a):
         raise NotANumber(f"{name} is {a}")
-    if a.shape != () or a.dtype != bool:
+    if a.size != 1 or a.dtype.kind not in "biu" or int(a.item()) not in (0, 1):
         raise WrongAnswer(f"{name} must be True or False, received {_show(value)}")
-    return bool(a)
+    return bool(a.item())  # of 0 and 1, too, and of one in an array
 
 
 def _distance(value):

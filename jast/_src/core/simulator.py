@@ -8,6 +8,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.tree_util import Partial
 
 from jast._src.core.typing import Disturbance, Evaluate, Init, IsTerminal, Observe, Start, Step
@@ -142,6 +143,8 @@ class Simulator:
                 object.__setattr__(self, f.name, value)
             elif value is None or isinstance(value, str | int | float | tuple | list | dict):
                 raise ValueError(f"Simulator: {f.name} must be a function, received {value!r}")
+        if isinstance(self.horizon, np.integer):
+            object.__setattr__(self, "horizon", int(self.horizon))
         if isinstance(self.horizon, bool) or not isinstance(self.horizon, int) or self.horizon < 1:
             raise ValueError(
                 f"Simulator: horizon must be an int of at least 1, received {self.horizon!r}"

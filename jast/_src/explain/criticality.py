@@ -129,7 +129,10 @@ def criticality(
         budget = checks.whole_number(name, "budget", budget, 1)
     elif hosted and draws is None:
         budget = HOSTED_BUDGET
-    episode = replay(sim, episode)
+    try:
+        episode = replay(sim, episode)
+    except ValueError as error:
+        raise ValueError(f"{name}: episode cannot be played again: {error}") from error
     steps = int(episode.length)
     draws = _affordable_draws(budget, draws, steps)
     rows = np.repeat(np.arange(steps + 1, dtype=np.int32), draws)

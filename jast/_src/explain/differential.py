@@ -73,7 +73,7 @@ def differential(
     """
     from jast.stress_testing import stress
 
-    return stress(key, regression(sim_a, sim_b), budget, **settings)
+    return stress(key, _regression("differential", sim_a, sim_b), budget, **settings)
 
 
 def regression(sim_a: Simulator, sim_b: Simulator) -> Simulator:
@@ -104,13 +104,17 @@ def regression(sim_a: Simulator, sim_b: Simulator) -> Simulator:
         >>> bool(jast.replay(both, jnp.concatenate([there, back, jnp.zeros(12)])).failure)
         True
     """
+    return _regression("regression", sim_a, sim_b)
+
+
+def _regression(caller, sim_a, sim_b):
     for sim in (sim_a, sim_b):
-        require_simulator("regression", sim)
+        require_simulator(caller, sim)
     a, b = signature_of(sim_a), signature_of(sim_b)
     for part, one, other in (("disturbance", a.x, b.x), ("start", a.x0, b.x0)):
         if _shapes(one) != _shapes(other):
             raise ValueError(
-                f"regression: {part} of sim_a and sim_b must have the same shapes, received"
+                f"{caller}: {part} of sim_a and sim_b must have the same shapes, received"
                 f" {_shapes(one)} and {_shapes(other)}"
             )
     return Simulator(

@@ -106,7 +106,8 @@ def check_devices(function: str, devices: Any, executor: Any) -> tuple[jax.Devic
         return None
     if executor is not None:
         raise ValueError(f"{function}: devices must be None where an executor is given")
-    devices = tuple(devices) if isinstance(devices, Sequence) else (devices,)
+    one = isinstance(devices, str) or not isinstance(devices, Sequence)
+    devices = (devices,) if one else tuple(devices)
     if not devices or not all(isinstance(d, jax.Device) for d in devices):
         raise ValueError(f"{function}: devices must be of jax.devices(), received {devices!r}")
     return devices
