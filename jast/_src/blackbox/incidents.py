@@ -12,18 +12,19 @@ def incidents(sim: Simulator) -> tuple[host_errors.Incident, ...]:
     """What has gone wrong so far in the host code behind a simulator, by kind and message.
 
     Args:
-        sim: the simulator.
+        sim: the simulator, or what holds one, as a report does.
 
     Returns:
         A tuple of `Incident`; ``()`` for a simulator in JAX.
 
     Raises:
-        ValueError: for what is no simulator.
+        ValueError: for what neither is nor holds one.
 
     Example:
         >>> import jast
         >>> jast.incidents.incidents(jast.simulators.walk1d())
         ()
     """
-    require_simulator("incidents", sim)
+    if not host_errors.runs_on_host(sim):
+        require_simulator("incidents", sim)
     return host_errors.incidents(sim)
