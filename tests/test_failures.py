@@ -17,7 +17,7 @@ from systems import PUBLISHED
 import jast
 from jast._src.core import failures as F
 from jast._src.io import save_load
-from jast.distributions import Independent, Joint, MultivariateNormalDiag, Normal
+from jast.distributions import Bernoulli, Independent, Joint, MultivariateNormalDiag, Normal
 
 FERRY = jast.simulators.ferry()
 REWARD = jast.rewards.standard(event_bonus=30.0, density="mode")
@@ -489,3 +489,40 @@ def test_what_is_no_archive_is_named(key, tmp_path):
         jast.failures.to_csv(tmp_path / "table.csv", report)
     with pytest.raises(ValueError, match="merge: b must be an archive .*received int"):
         jast.failures.merge(report.failures, 3)
+
+
+def fair(horizon):
+    """Steps of +-1 by a fair coin, which fail at 3: each is as likely as the mode."""
+    return jast.Simulator(
+        init=lambda x0: jnp.zeros(()),
+        step=lambda s, x: s + jnp.where(x == 1, 1.0, -1.0),
+        disturbance=lambda s: Bernoulli(probs=0.5),
+        evaluate=lambda s: (s >= 3, jnp.maximum(3.0 - s, 0.0)),
+        horizon=horizon,
+    )
+
+
+def test_of_as_likely_relative_to_the_mode_the_likeliest_is_first():
+    """Of 2^9 sequences of a fair coin the likeliest has three steps: log p is 3 log(1/2)."""
+    sim = fair(9)
+    coins = (np.arange(2**9)[:, None] >> np.arange(9) & 1).astype(np.int32)
+    all_of = jax.vmap(lambda x: jast.replay(sim, x, reward=jast.rewards.likelihood(sim)))(coins)
+    found = F.collect(sim, jast.rewards.likelihood(sim), all_of)
+    assert not found.episodes.reward.any()
+    assert list(found.episodes.length[:2]) == [3, 5] and (np.diff(found.episodes.length) >= 0).all()
+    np.testing.assert_allclose(found.best.log_prob, 3 * np.log(0.5), rtol=1e-6)
+    for top in (1, 4):
+        both = F.merge(found[4:], found[:4], top=top)
+        same(both.episodes, found[:top].episodes)
+
+
+def test_rewards_within_rounding_are_ranked_by_log_p():
+    """Three units of the last digit are rounding, a hundred are not; infinite ones stay apart."""
+    reward = np.float32([-4, -4 + 3 * np.spacing(np.float32(4)), -4 + 1e-4, -np.inf, -np.inf, 5])
+    log_p = np.float32([-1, -2, -9, -3, -2, -9])
+    blank = F.empty(WALK).episodes
+    episodes = blank._replace(reward=reward, log_prob=log_p)
+    assert list(F.rank(episodes)) == [2, 3, 1, 5, 4, 0]
+    backwards = episodes._replace(reward=reward[::-1], log_prob=log_p[::-1])
+    assert list(F.rank(backwards)) == [0, 4, 5, 1, 3, 2]
+    assert len(F.rank(blank)) == 0

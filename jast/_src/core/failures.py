@@ -34,17 +34,21 @@ __all__ = [
     "identity",
     "load",
     "merge",
+    "rank",
     "save",
     "to_csv",
     "to_numpy",
 ]
+
+ROUNDING = 8  # units of the last digit by which sums of as likely disturbances may differ
 
 
 @display.printable("seen")
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True, eq=False)
 class Failures:
-    """The n best distinct failures, by falling reward: a sequence of them. Also a pytree of arrays.
+    """The n best distinct failures, by falling reward, equal ones by falling log p: a sequence of
+    them. Also a pytree of arrays.
 
     ``len(failures)`` is n, ``failures[i]`` the i-th best `Episode`, a slice is an archive of its
     own, and a loop runs over the episodes.
@@ -127,7 +131,8 @@ class Failures:
 
     @property
     def best(self) -> Episode | None:
-        """The `Episode` of the highest reward, or None where there is no failure."""
+        """The `Episode` of the highest reward, of equal ones that of the highest log p, or None
+        where there is no failure."""
         return self.episode(0) if self.size else None
 
     def episode(self, i: int) -> Episode:
@@ -377,15 +382,33 @@ def identity(episode):
     return length, *(np.ascontiguousarray(a).tobytes() for a in leaves)
 
 
+def rank(episodes: Episode) -> np.ndarray:
+    """The place of each of ``episodes`` [n], 0 for the best: by falling reward, and of rewards that
+    differ by no more than rounding by falling log p; equal in both is the same place.
+
+    Of a fair coin, and of every longer episode whose further steps are modes, log p relative to the
+    mode is the same: the likeliest of them is that of the fewest steps.
+    """
+    reward, log_p = np.asarray(episodes.reward), np.asarray(episodes.log_prob)
+    order = np.argsort(-reward, kind="stable")
+    above, below = reward[order][:-1], reward[order][1:]
+    with np.errstate(invalid="ignore"):  # of those that are infinite
+        equal = (above == below) | (above - below <= ROUNDING * np.spacing(np.abs(below)))
+    level = np.zeros(len(order))
+    level[order[1:]] = np.cumsum(~equal)
+    _, place = np.unique(np.stack([level, -log_p], axis=1), axis=0, return_inverse=True)
+    return place.reshape(-1)
+
+
 def _best(caller, failures, top):
     """The best ``top``, with equal ones put together; ``seen`` and ``dropped`` are left to the
     caller.
     """
     if isinstance(top, bool) or not isinstance(top, int | np.integer) or top < 1:
         raise ValueError(f"{caller}: top must be an int of at least 1, received {top!r}")
-    # equal rewards are ordered by when they were found, so that the order of the candidates does
-    # not matter
-    order = np.lexsort((failures.tree, failures.simulation, -failures.episodes.reward))
+    # equal ones are ordered by when they were found, so that the order of the candidates does not
+    # matter
+    order = np.lexsort((failures.tree, failures.simulation, rank(failures.episodes)))
     groups = {}
     for i in order:
         groups.setdefault(identity(index_tree(failures.episodes, i)), []).append(i)

@@ -12,7 +12,7 @@ import numpy as np
 
 from jast._src.core.check import check
 from jast._src.core.episode import rollout, stacked
-from jast._src.core.failures import Failures, collect, empty, merge
+from jast._src.core.failures import Failures, collect, empty, merge, rank
 from jast._src.core.nominal import BRIEF, nominal
 from jast._src.core.rewards import likelihood
 from jast._src.core.simulator import Simulator, require_simulator
@@ -598,10 +598,10 @@ def _with_likelier(sim: Simulator, found: Modes, failures: Failures) -> Modes:
     """
     heads = [m.failure for m in found]
     for e, k in zip(failures, owners(sim, failures.episodes, stacked(heads)), strict=True):
-        if float(e.reward) > float(heads[k].reward):
+        if rank(stacked([e, heads[k]]))[1] > 0:
             heads[k] = e
-    kept = [m._replace(failure=e) for m, e in zip(found, heads, strict=True)]
-    return Modes(sorted(kept, key=lambda m: -float(m.failure.reward)), found.evaluations)
+    order = np.argsort(rank(stacked(heads)), kind="stable")
+    return Modes([found[i]._replace(failure=heads[i]) for i in order], found.evaluations)
 
 
 def _best_log_density(failures: Failures) -> float:

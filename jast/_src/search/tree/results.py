@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jast._src.core.episode import Episode
-from jast._src.core.failures import identity
+from jast._src.core.failures import identity, rank
 from jast._src.search.driver import Log, finish, finish_traced
 from jast._src.search.lanes import NEVER, Tally
 from jast._src.search.result import History, SearchResult, Trials
@@ -86,11 +86,11 @@ def _trials(batches: list[TreeBatch], value, failed, fresh) -> Trials | None:
 
 
 def _distinct(found: Episode, tree, simulation, top: int) -> np.ndarray:
-    """Candidates worth a replay: failures by falling reward, up to a few more distinct ones than
+    """Candidates worth a replay: failures, the best first, up to a few more distinct ones than
     the archive holds.
     """
     names, chosen, seen = set(), [], set()
-    for i in np.argsort(-found.reward, kind="stable"):
+    for i in np.argsort(rank(found), kind="stable"):
         if not found.failure[i] or (tree[i], simulation[i]) in seen:
             continue
         seen.add((tree[i], simulation[i]))
