@@ -11,6 +11,8 @@ import pytest
 from jax.tree_util import Partial
 from scipy import stats
 
+import jast
+from jast import distributions as D
 from jast._src.estimate.population.descents import by_distance
 from jast._src.estimate.population.failure_sample import sample_from
 from jast._src.io import codec
@@ -152,9 +154,75 @@ def test_where_nothing_fails_nothing_is_told(key):
 
 
 def test_one_mode_has_all(key):
-    sim, heads, _ = sides(3.0, 3.0)
-    (only,), *rest = mode_shares(key, sim, None, known(sim, heads[:1]), BUDGET)
-    assert (only.share, only.share_interval) == (1, (1, 1)) and rest == [0, 0]
+    """What is below -9 is 1e-16 of what is above 3; some 40 failures tell it."""
+    sim, heads, _ = sides(3.0, 9.0)
+    q = mixture(sim, heads[:1])
+    (only,), failing, spent = mode_shares(key, sim, q, known(sim, heads[:1]), BUDGET)
+    assert only.share == 1 and failing > 40 and spent <= shares_cost(BUDGET, 1)
+    low, high = only.share_interval
+    assert 0.85 < low < 1 and high == 1
+
+
+def test_one_mode_of_two_leaves_the_other_out():
+    """What is of the mode that is not known is missing from the shares, and stands below them."""
+    sim, heads, share = sides(3.0, 3.2)
+    q, ways, inside = mixture(sim, heads), known(sim, heads[:1]), 0
+    for i in range(40):
+        found, _, spent = mode_shares(jax.random.key(i), sim, q, ways, BUDGET)
+        low, high = found[0].share_interval
+        inside += low <= share <= high
+        assert found.others == pytest.approx(1 - found[0].share)
+        assert spent <= shares_cost(BUDGET, 1) + 24 * 18
+    assert inside >= fewest(40)
+    line = str(found).splitlines()[-1]
+    assert line.startswith("failures of no mode above") and f"{100 * found.others:.0f} %" in line
+
+
+def coin_or_zeros():
+    """Fails at a step whose coin (1e-4) is 1, or after 4 zeros in a row (.049 each) of six steps:
+    (simulator, a likeliest failure of each way, the share of the coin).
+    """
+    p = np.full(20, 0.951 / 19)
+    p[0] = 0.049
+    sim = jast.Simulator(
+        init=lambda x0: jnp.zeros(()),
+        step=lambda s, x: jnp.where(x["c"] > 0, 9.0, jnp.where(x["d"] == 0, s + 1, 0.0)),
+        disturbance=lambda s: D.Joint(
+            {"c": D.Bernoulli(probs=1e-4), "d": D.Categorical(probs=jnp.asarray(p))}
+        ),
+        evaluate=lambda s: (s >= 4, jnp.maximum(4.0 - s, 0.0)),
+        horizon=6,
+    )
+    coin, zeros = np.zeros((2, 6, 2))
+    coin[4, 0], zeros[:4, 1] = 4.0, -2.0
+    truth = _coin_and_zeros(1e-4), _coin_and_zeros(0.0)
+    return sim, np.stack([coin, zeros]).reshape(2, 12), 1 - truth[1] / truth[0]
+
+
+def _coin_and_zeros(coin):
+    """The probability of `coin_or_zeros`, by its Markov chain of zeros in a row."""
+    at, failed = np.array([1.0, 0, 0, 0]), 0.0
+    for _ in range(6):
+        zero = (1 - coin) * 0.049 * at
+        failed += coin * at.sum() + zero[3]
+        at = np.array([(1 - coin) * 0.951 * at.sum(), *zero[:3]])
+    return failed
+
+
+def test_noise_that_decides_nothing_tells_no_modes_apart():
+    """Most failures are a coin at another step than the likeliest's, with whatever numbers beside
+    it: of 9.2 standard deviations that lead to the zeros these take some by chance.
+    """
+    sim, heads, share = coin_or_zeros()
+    each = np.eye(6)[:, :, None] * np.array([4.0, 0.0])
+    q = mixture(sim, np.concatenate([each.reshape(6, 12), heads[1:]]))
+    ways, inside = known(sim, heads), 0
+    for i in range(10):
+        coin, _ = mode_shares(jax.random.key(i), sim, q, ways, 2 * BUDGET)[0]
+        low, high = coin.share_interval
+        inside += low <= share <= high
+        assert coin.share > 0.7
+    assert inside >= fewest(10)
 
 
 def wrong(rng, m, towards, seldom):

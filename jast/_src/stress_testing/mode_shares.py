@@ -14,7 +14,8 @@ from jast._src.estimate.proposal_search.mixture_draws import resample
 from jast._src.estimate.redraw import redraw
 from jast._src.normal_space import transform
 from jast._src.normal_space.mode_coordinates import centred
-from jast._src.search.refine.connectivity import Paths, assigned, nearest
+from jast._src.normal_space.transform import unit
+from jast._src.search.refine.connectivity import ALIKE, Paths, assigned, nearest
 from jast._src.search.refine.modes import UNKNOWN, Modes
 from jast._src.util.intervals import effective_interval
 
@@ -25,14 +26,23 @@ LARGE_BUDGET = 100_000  # evaluations of the whole budget from which on there ar
 SMALL_DRAWS = 1024  # draws of the proposal below a large budget: a tenth of it at most
 LARGE_DRAWS = 4096  # the same with a large budget: shares are then known to a few per cent
 DRAWS_PER_FAILURE = 4  # of this many draws one failure is chosen, by weight
+ONE_MODE_DRAWS = 256  # draws where one mode is known: do all failures belong to it?
 MAX_PATH_FAILURES = 128  # failures that are told apart by paths, too
+AT_A_TIME = 4  # of these: so many have their paths before it is seen whether more can be paid
 PATHS_SHARE = 0.05  # share of the budget that these paths may cost
+ONE_MODE_PATHS_SHARE = 0.02  # the same where one mode is known
+TOWARDS = 2.0
+"""How far towards the likeliest failure of a mode one lies at least, in standard deviations, that
+is of it without a path; and half of the way. In a direction that is none of its own a failure is so
+far out once in 44 times."""
 
 
-def shares_cost(budget: int) -> int:
-    """Evaluations that `mode_shares` takes at most, nearly: the last paths may take more."""
-    n = _number_of_draws(budget)
-    return n + n // DRAWS_PER_FAILURE + int(PATHS_SHARE * budget) if n else 0
+def shares_cost(budget: int, modes: int = 2) -> int:
+    """Evaluations that `mode_shares` of so many ``modes`` takes at most, nearly: the last paths may
+    take more.
+    """
+    n = _number_of_draws(budget, modes)
+    return n + n // DRAWS_PER_FAILURE + _paths_budget(budget, modes) if n else 0
 
 
 def mode_shares(
@@ -42,21 +52,20 @@ def mode_shares(
     failures of ``q``: of a proposal, or of the `Sample` that populations leave.
 
     Every failure is of the mode in whose direction it lies; a part of them are told apart by paths,
-    too, and say how many of those that lie towards one mode are of another. What a path says is
-    taken as the truth: of the failures of the README's lane, of which many are far out and near to
-    both sides, it names the side on which they left the lane for four of five, for either side.
+    too, and say how many of those that lie towards one mode are of another, or of none that is
+    known: what the shares lack of 1. What a path says is taken as the truth: of the failures of the
+    README's lane, of which many are far out and near to both sides, it names the side on which they
+    left the lane for four of five, for either side.
 
     Returns:
         (`Modes`, whose shares are NaN where there was nothing to tell them from; draws that failed;
         evaluations).
     """
-    n, k = _number_of_draws(budget), len(modes)
-    if k == 1:
-        return _with_shares(modes, np.ones(1), [(1.0, 1.0)]), 0, 0
+    n, k = _number_of_draws(budget, len(modes)), len(modes)
     unknown = _with_shares(modes, np.full(k, np.nan), [UNKNOWN] * k)
     if not n:
         return unknown, 0, 0
-    z, unit, failing, spent = _draw_failures(key, sim, q, n)
+    z, group, failing, spent = _draw_failures(key, sim, q, n)
     if not failing:
         return unknown, 0, spent
     of_modes = centred(sim)
@@ -66,12 +75,36 @@ def mode_shares(
 
     targets = place(stacked(m.failure for m in modes))
     points, ends = place(transform.played(sim, z))
-    step = len(z) // MAX_PATH_FAILURES
-    some = np.arange(step // 2, len(z), step)
-    paths = Paths(of_modes, int(PATHS_SHARE * budget))
-    exact = assigned(paths, (points[some], ends[some]), targets, np.arange(k))
-    found = corrected_shares(nearest(points, targets[0]), some, exact, unit, k)
+    step = max(len(z) // MAX_PATH_FAILURES, 1)
+    some = numpy_generator(key, 1).permutation(np.arange(step // 2, len(z), step))
+    most = _paths_budget(budget, k)
+    paths = Paths(of_modes, 2 * most)  # so that the last ones are not cut short
+    exact = _told_apart(paths, (points[some], ends[some]), targets, most)
+    some = some[: len(exact)]
+    found = corrected_shares(nearest(points, targets[0]), some, exact, group, k)
     return _with_shares(modes, *found), failing, spent + len(z) + paths.spent
+
+
+def _told_apart(paths, failures, targets, most):
+    """The mode of each of the first ``failures`` (points [m, D], steps [m]) of the ``targets``
+    (points [k, D], steps [k]), or k for none of them: as many as ``most`` evaluations do for. Where
+    that is not for all, those that point as a target does need no path.
+    """
+    (points, ends), k = failures, len(targets[0])
+    cosine, reach = unit(points) @ unit(targets[0]).T, points @ unit(targets[0]).T
+    near, rows = np.argmax(cosine, axis=1), np.arange(len(points))
+    far = reach[rows, near] >= np.maximum(TOWARDS, np.linalg.norm(targets[0], axis=1)[near] / 2)
+    exact = np.where(far, near, k)  # where there is no path
+    clear = (cosine.max(axis=1) > ALIKE) & (paths.room < 2 * len(points))
+    exact[clear] = near[clear]
+    asked = np.flatnonzero(~clear)
+    for first in range(0, len(asked), AT_A_TIME):
+        some = asked[first : first + AT_A_TIME]
+        if paths.spent >= most:
+            return exact[: some[0]]
+        owner = assigned(paths, (points[some], ends[some]), targets, np.arange(k), none=-1)
+        exact[some] = np.where(owner >= 0, owner, exact[some])
+    return exact
 
 
 def corrected_shares(
@@ -86,7 +119,7 @@ def corrected_shares(
     Args:
         near: [m] the mode in whose direction each failure lies.
         some: [f] those of them that were told apart by paths, and
-        exact: [f] their modes.
+        exact: [f] their modes, ``k`` for none of these.
         unit: [m] the draw, or the first point of a population, that each comes from; units are
             independent.
         k: modes.
@@ -94,11 +127,10 @@ def corrected_shares(
     Returns:
         (shares [k], their (low, high)).
     """
-    one_hot, m = np.eye(k), len(near)
-    seen = one_hot[near[some]].T @ one_hot[exact]
-    total = seen.sum(axis=1, keepdims=True)
-    # [near, exact]
-    truly = np.where(total > 0, seen / np.maximum(total, 1), one_hot)
+    one_hot, m = np.eye(k + 1, k), len(near)
+    total = one_hot[near[some]].sum(axis=0)[:, None]
+    seen = one_hot[near[some]].T @ one_hot[exact]  # [near, exact]
+    truly = np.where(total > 0, seen / np.maximum(total, 1), one_hot[:k])
     lying = one_hot[near].mean(axis=0)
     found = lying @ truly
     error = (truly[near] - found) / m
@@ -144,7 +176,13 @@ def _with_shares(modes, shares, intervals):
     return Modes(shared, modes.evaluations)
 
 
-def _number_of_draws(budget):
+def _paths_budget(budget, modes):
+    return int((PATHS_SHARE if modes > 1 else ONE_MODE_PATHS_SHARE) * budget)
+
+
+def _number_of_draws(budget, modes):
     if budget < MIN_BUDGET:
         return 0
+    if modes == 1:
+        return ONE_MODE_DRAWS
     return LARGE_DRAWS if budget >= LARGE_BUDGET else SMALL_DRAWS

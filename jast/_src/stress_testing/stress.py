@@ -511,13 +511,13 @@ class _StressTest:
             return self.keep_probability(p, "plain draws")
         if not len(self.pool):  # the estimate may find what the search did not
             rest -= self.parts.refine + self.parts.slow_search
-        if len(self.modes) > 1:
-            rest -= shares_cost(self.budget)
+        rest -= shares_cost(self.budget, len(self.modes)) if self.modes else 0
         failures = self.refined if len(self.refined) else None
         rest = max(rest, few_calls.LEAST)
         p = failure_probability(self.next_key(), self.sim, rest, failures=failures, **places)
         self.keep_probability(p, "probability")
-        short = self.hosted and self.budget - self.spent < shares_cost(self.budget)
+        short = self.budget - self.spent < shares_cost(self.budget, len(self.modes))
+        short = short and self.hosted
         if p.proposal is None or short:
             return
         if not len(self.pool):

@@ -131,13 +131,13 @@ def _nearest_pairs(cosine, open, owner, tops):
     return np.array(sorted(found, key=lambda pair: -cosine[pair]), int).reshape(-1, 2)
 
 
-def assigned(paths, many, known, owner):
+def assigned(paths, many, known, owner, none=None):
     """Of each of ``many`` failures (points [m, D], steps [m]) the owner, given those of ``known``
-    (points [n, D], steps [n]).
+    (points [n, D], steps [n]). Without a path it is ``none``, or the one that is nearest.
     """
     (w, ends), (v, known_ends) = many, known
     order = np.argsort(-unit(w) @ unit(v).T, axis=1)
-    out = owner[order[:, 0]]
+    out = owner[order[:, 0]] if none is None else np.full(len(w), none)
     left = np.ones(len(w), bool)
     for k in range(min(order.shape[1], 8)):
         rows = np.flatnonzero(left)

@@ -45,8 +45,7 @@ class Mode(NamedTuple):
     """Of the probability of failure, where there is an estimate, or NaN where that is too small to
     be divided; else of the failures found."""
     share_interval: tuple[float, float] = UNKNOWN
-    """(low, high) of a share of the probability, at 95 %; NaN where that is not known. Modes that
-    were not found are no part of it."""
+    """(low, high) of a share of the probability, at 95 %; NaN where that is not known."""
 
     @property
     def share_words(self) -> str:
@@ -78,6 +77,14 @@ class Modes(tuple):
         self = super().__new__(cls, items)
         self.evaluations = evaluations
         return self
+
+    @property
+    def others(self) -> float:
+        """The share of the probability that is of none of these modes, as far as failures of the
+        estimate tell; 0 where nothing tells.
+        """
+        told = [m.share for m in self if not np.isnan([m.share, *m.share_interval]).any()]
+        return max(1.0 - sum(told), 0.0) if told else 0.0
 
     def _asdict(self) -> dict[str, Any]:
         """For files."""
@@ -115,6 +122,8 @@ class Modes(tuple):
                 f"{i:4d} {float(e.reward):11.4f} {float(e.log_prob):11.4f} {int(e.length):6d}"
                 f" {mode.members:8d} {mode.share_words:>{wide}}"
             )
+        if round(100 * self.others) > 0:
+            lines.append(f"failures of no mode above {100 * self.others:{18 + wide}.0f} %")
         return "\n".join(lines)
 
     __repr__ = __str__
