@@ -1,13 +1,14 @@
 """Which part of the probability of failure is of which failure mode."""
 
 import math
+from collections.abc import Callable
 from typing import Any
 
 import jax
 import numpy as np
 
 from jast._src.core.counter_prng import numpy_generator
-from jast._src.core.episode import stacked
+from jast._src.core.episode import Episode, stacked
 from jast._src.core.simulator import Simulator
 from jast._src.estimate.population.failure_sample import Sample
 from jast._src.estimate.proposal_search.mixture_draws import resample
@@ -18,6 +19,7 @@ from jast._src.normal_space.transform import unit
 from jast._src.search.refine.connectivity import ALIKE, Paths, assigned, nearest
 from jast._src.search.refine.modes import UNKNOWN, Modes
 from jast._src.util.intervals import effective_interval
+from jast._src.util.pytrees import index_tree
 
 __all__ = ["corrected_shares", "mode_shares", "shares_cost"]
 
@@ -31,6 +33,7 @@ MAX_PATH_FAILURES = 128  # failures that are told apart by paths, too
 AT_A_TIME = 4  # of these: so many have their paths before it is seen whether more can be paid
 PATHS_SHARE = 0.05  # share of the budget that these paths may cost
 ONE_MODE_PATHS_SHARE = 0.02  # the same where one mode is known
+SOME_OTHERS = 0.05  # share of the failures from which on those of no known mode are looked into
 TOWARDS = 2.0
 """How far towards the likeliest failure of a mode one lies at least, in standard deviations, that
 is of it without a path; and half of the way. In a direction that is none of its own a failure is so
@@ -46,7 +49,12 @@ def shares_cost(budget: int, modes: int = 2) -> int:
 
 
 def mode_shares(
-    key: jax.Array, sim: Simulator, q: Any, modes: Modes, budget: int
+    key: jax.Array,
+    sim: Simulator,
+    q: Any,
+    modes: Modes,
+    budget: int,
+    more: Callable[[Episode], Modes] | None = None,
 ) -> tuple[Modes, int, int]:
     """``modes`` with the share of the probability that each has and its 95 % interval, told from
     failures of ``q``: of a proposal, or of the `Sample` that populations leave.
@@ -56,6 +64,15 @@ def mode_shares(
     known: what the shares lack of 1. What a path says is taken as the truth: of the failures of the
     README's lane, of which many are far out and near to both sides, it names the side on which they
     left the lane for four of five, for either side.
+
+    Args:
+        key: of the draws.
+        sim: the simulator.
+        q: of the estimate.
+        modes: those that are known.
+        budget: evaluations of the whole.
+        more: from the failures [m] that are of none of the modes, where these have `SOME_OTHERS` of
+            the probability, to more modes, whose shares are told in their place.
 
     Returns:
         (`Modes`, whose shares are NaN where there was nothing to tell them from; draws that failed;
@@ -73,16 +90,22 @@ def mode_shares(
     def place(e):
         return transform.normal_of(of_modes, e).astype(np.float64), np.asarray(e.length)
 
-    targets = place(stacked(m.failure for m in modes))
-    points, ends = place(transform.played(sim, z))
+    episodes = transform.played(sim, z)
+    points = place(episodes)
     step = max(len(z) // MAX_PATH_FAILURES, 1)
     some = numpy_generator(key, 1).permutation(np.arange(step // 2, len(z), step))
-    most = _paths_budget(budget, k)
-    paths = Paths(of_modes, 2 * most)  # so that the last ones are not cut short
-    exact = _told_apart(paths, (points[some], ends[some]), targets, most)
-    some = some[: len(exact)]
-    found = corrected_shares(nearest(points, targets[0]), some, exact, group, k)
-    return _with_shares(modes, *found), failing, spent + len(z) + paths.spent
+    spent += len(z)
+    while True:
+        targets, k = place(stacked(m.failure for m in modes)), len(modes)
+        most = _paths_budget(budget, k)
+        paths = Paths(of_modes, 2 * most)  # so that the last ones are not cut short
+        exact = _told_apart(paths, (points[0][some], points[1][some]), targets, most)
+        told, spent = some[: len(exact)], spent + paths.spent
+        found = corrected_shares(nearest(points[0], targets[0]), told, exact, group, k)
+        others = told[exact == k]
+        if more is None or len(others) < SOME_OTHERS * len(told):
+            return _with_shares(modes, *found), failing, spent
+        modes, more = more(index_tree(episodes, others)), None
 
 
 def _told_apart(paths, failures, targets, most):

@@ -11,7 +11,7 @@ import jax
 import numpy as np
 
 from jast._src.core.check import check
-from jast._src.core.episode import rollout, stacked
+from jast._src.core.episode import Episode, rollout, stacked
 from jast._src.core.failures import Failures, collect, empty, merge, rank
 from jast._src.core.nominal import BRIEF, nominal
 from jast._src.core.rewards import likelihood
@@ -101,6 +101,9 @@ LAST_SHARE = 0.15  # of the budget, what a black box keeps for the probability, 
 FALSIFY_SHARE = 0.2
 """Share of a black box's search that looks for a first failure, at most, where several explorers
 follow; below `MIN_DIVIDED_BUDGET` all of it may."""
+OTHERS_SHARE = 0.025
+"""Share of the budget, beyond it, by which failures of the estimate are refined that are of no mode
+known, where these are more than a few."""
 LEAST_REFINED = 100  # evaluations that `refine` takes at least
 REFINED_FACTOR = 8  # failures that refinement starts from for each that is returned
 FOUND_FACTOR = 4  # failures of one explorer for each that is returned
@@ -571,9 +574,23 @@ class _StressTest:
             q = p.draws.source  # independent draws tell more than few populations
         self.watch.doing("shares of modes")
         budget = min(self.budget, DEFAULT_BUDGET)
-        self.modes, failing, cost = mode_shares(self.next_key(), self.sim, q, self.modes, budget)
+        more = None if self.hosted else self.modes_with
+        self.modes, failing, cost = mode_shares(
+            self.next_key(), self.sim, q, self.modes, budget, more
+        )
         if cost:
             self.note("shares of modes", cost, failing)
+
+    def modes_with(self, others: Episode) -> Modes:
+        """The modes with those of failures of the estimate that are of none of them."""
+        before, kept = _best_log_density(self.failures), (self.residual, self.late)
+        n = len(others.length)
+        start = self.add_failures("failures of no mode", ExplorerResult(others, 0, n, 0))
+        found = self.refine_from(start, int(OTHERS_SHARE * self.budget))
+        if _best_log_density(self.failures) <= before:
+            self.residual, self.late = kept
+        self.failures = merge(self.failures, found, top=self.top)
+        return self.modes
 
     def report(self, settings):
         self.keep_failing_runs()

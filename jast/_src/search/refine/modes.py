@@ -53,7 +53,7 @@ class Mode(NamedTuple):
         if np.isnan(self.share):
             return "-"
         low, high = self.share_interval
-        of_members = " of members" if self.share < 1 and np.isnan(low) else ""
+        of_members = " of members" if np.isnan(low) else ""
         more = f" [{math.floor(100 * low)}, {math.ceil(100 * high)}]" if low < high else of_members
         return f"{100 * self.share:.0f} %{more}"
 
