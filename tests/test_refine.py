@@ -15,7 +15,15 @@ from jast._src.normal_space import transform
 from jast._src.normal_space.mode_coordinates import centred
 from jast._src.search.refine import refine as refinement
 from jast._src.search.refine.modes import modes
-from jast.distributions import Exponential, Laplace, MultivariateNormalDiag, Normal, tent, where
+from jast.distributions import (
+    Exponential,
+    Laplace,
+    MultivariateNormalDiag,
+    Normal,
+    Poisson,
+    tent,
+    where,
+)
 from jast.failures import collect
 from jast.rewards import likelihood
 from jast.search import refine
@@ -252,3 +260,23 @@ def test_what_are_no_failures_is_refused(key):
         modes(linear(4), [])
     with pytest.raises(ValueError, match="modes: others must be an archive .* received int"):
         modes(linear(4), draws(linear(4), 1.0), 3)
+
+
+def test_counts_give_up_a_unit_to_one_another(key):
+    """Ten units in five steps of Poisson(.3): two each are the likeliest, 5 log(.3^2 / 2) relative
+    to none at all; no count can fall alone.
+    """
+    sim = jast.Simulator(
+        init=lambda x0: jnp.zeros(()),
+        step=lambda s, x: s + x.astype(s.dtype),
+        disturbance=lambda s: Poisson(0.3),
+        evaluate=lambda s: (s >= 10, jnp.maximum(10.0 - s, 0.0)),
+        horizon=5,
+    )
+    counts = jnp.asarray([[3, 2, 1, 2, 2], [4, 0, 4, 1, 1]], jnp.int32)
+    given = jax.vmap(lambda x: jast.replay(sim, x, reward=likelihood(sim)))(counts)
+    for i in (0, 1):
+        start = jax.tree.map(lambda a, i=i: a[i : i + 1], given._replace(states=None))
+        best = refine(key, sim, start, budget=4000).failures.best
+        assert list(best.disturbances) == [2, 2, 2, 2, 2]
+        assert float(best.reward) == pytest.approx(5 * np.log(0.3**2 / 2), rel=1e-5)

@@ -12,7 +12,8 @@ it takes. Candidates are:
 - *removals*: some of the numbers drawn to 0, wholly or partly;
 - *exchanges*: one number drawn towards 0, and another raised by what keeps the miss distance as it
   is, to first order: where log p has a kink at its mode, the likeliest failures have many numbers
-  at 0, and no slope tells which of them is to leave it;
+  at 0, and no slope tells which of them is to leave it; or, without slopes, two numbers drawn to
+  their mean;
 - *shifts*: the same disturbances some steps later or sooner, drawn in a little.
 
 Sizes of steps grow where they pay and shrink where they do not, for each point by itself.
@@ -264,14 +265,16 @@ def _removed(point, noise):
 def _exchanged(point, noise):
     """Of each pair of numbers one is drawn towards 0 by the share ``sizes``, and the other makes up
     for it. In the first half the number drawn in is, of a few, the one whose part in the failure is
-    the dearest, and the other that of which more is the cheapest.
+    the dearest, and the other that of which more is the cheapest; where no slope is known both are
+    drawn to their mean, by which counts give up a unit to one another.
     """
     v, slope, (live, _) = point.v, point.slope, _live(point)
     steep = np.where(slope != 0, slope, 1)
     price = np.where(slope != 0, _helpful(slope) * point.rise / np.abs(steep), 0)
     dear = np.where(v * slope < 0, -price, np.inf)
     lowered = _picked(live & (v != 0), noise.pairs[:, :, 0], dear)
-    raised = _picked(live & (slope != 0), noise.pairs[:, :, 1], price)
+    flat = ~slope.any(axis=1, keepdims=True)
+    raised = _picked(live & (flat | (slope != 0)), noise.pairs[:, :, 1], price)
     row = np.arange(len(v))[:, None]
     drop = noise.sizes * v[row, lowered]
     # by a little more than to first order, for a boundary that bends
@@ -279,8 +282,10 @@ def _exchanged(point, noise):
     back = np.where((raised != lowered) & (slope[row, raised] != 0) & np.isfinite(back), back, 0)
     moved = v[:, None].repeat(drop.shape[1], axis=1)
     n, e = np.indices(drop.shape)
-    moved[n, e, lowered] -= drop
-    moved[n, e, raised] += back
+    level = (v[row, lowered] + v[row, raised]) / 2
+    flat = flat & (e < e.shape[1] // 2)
+    moved[n, e, lowered] = np.where(flat, level, v[row, lowered] - drop)
+    moved[n, e, raised] = np.where(flat, level, moved[n, e, raised] + back)
     return moved
 
 
