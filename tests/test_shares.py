@@ -180,7 +180,7 @@ def test_one_mode_of_two_leaves_the_other_out():
 
 def coin_or_zeros():
     """Fails at a step whose coin (1e-4) is 1, or after 4 zeros in a row (.049 each) of six steps:
-    (simulator, a likeliest failure of each way, the share of the coin).
+    (simulator, the `Modes` with a likeliest failure of each way, the share of the coin).
     """
     p = np.full(20, 0.951 / 19)
     p[0] = 0.049
@@ -193,10 +193,12 @@ def coin_or_zeros():
         evaluate=lambda s: (s >= 4, jnp.maximum(4.0 - s, 0.0)),
         horizon=6,
     )
-    coin, zeros = np.zeros((2, 6, 2))
-    coin[4, 0], zeros[:4, 1] = 4.0, -2.0
+    coin, most = np.eye(6, dtype=np.int32)[4], int(D.mode(sim.disturbance(0.0))["d"])
+    zeros = np.int32([0, 0, 0, 0, most, most])
+    ways = [{"c": coin, "d": np.full_like(coin, most)}, {"c": 0 * coin, "d": zeros}]
+    failures = [jax.device_get(jast.replay(sim, x)) for x in ways]
     truth = _coin_and_zeros(1e-4), _coin_and_zeros(0.0)
-    return sim, np.stack([coin, zeros]).reshape(2, 12), 1 - truth[1] / truth[0]
+    return sim, Modes(Mode(e, 1, math.nan) for e in failures), 1 - truth[1] / truth[0]
 
 
 def _coin_and_zeros(coin):
@@ -211,12 +213,12 @@ def _coin_and_zeros(coin):
 
 def test_noise_that_decides_nothing_tells_no_modes_apart():
     """Most failures are a coin at another step than the likeliest's, with whatever numbers beside
-    it: of 9.2 standard deviations that lead to the zeros these take some by chance.
+    it, which take many of them some way towards the zeros.
     """
-    sim, heads, share = coin_or_zeros()
-    each = np.eye(6)[:, :, None] * np.array([4.0, 0.0])
-    q = mixture(sim, np.concatenate([each.reshape(6, 12), heads[1:]]))
-    ways, inside = known(sim, heads), 0
+    sim, ways, share = coin_or_zeros()
+    coins = np.eye(6)[:, :, None] * np.array([4.0, 0.0])
+    zeros = np.arange(12) % 2 * np.where(np.arange(12) < 8, -2.0, 0.0)
+    q, inside = mixture(sim, np.concatenate([coins.reshape(6, 12), zeros[None]])), 0
     for i in range(10):
         coin, _ = mode_shares(jax.random.key(i), sim, q, ways, 2 * BUDGET)[0]
         low, high = coin.share_interval
