@@ -586,7 +586,7 @@ class _StressTest:
         before, kept = _best_log_density(self.failures), (self.residual, self.late)
         n = len(others.length)
         start = self.add_failures("failures of no mode", ExplorerResult(others, 0, n, 0))
-        found = self.refine_from(start, int(OTHERS_SHARE * self.budget))
+        found = self.refine_from(start, int(OTHERS_SHARE * min(self.budget, DEFAULT_BUDGET)))
         if _best_log_density(self.failures) <= before:
             self.residual, self.late = kept
         self.failures = merge(self.failures, found, top=self.top)
