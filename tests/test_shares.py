@@ -178,6 +178,21 @@ def test_one_mode_of_two_leaves_the_other_out():
     assert line.startswith("failures of no mode above") and f"{100 * found.others:.0f} %" in line
 
 
+def test_failures_that_lead_to_the_known_modes_are_theirs(key):
+    """One mode of two is known, and from the failures of the other `more` comes to no new one."""
+    sim, heads, _ = sides(3.0, 3.2)
+    q, one, asked = mixture(sim, heads), known(sim, heads[:1]), []
+
+    def more(others):
+        asked.extend(others.length)
+        return one
+
+    (alone,), *_ = mode_shares(key, sim, q, one, BUDGET)
+    (told,), *_ = mode_shares(key, sim, q, one, BUDGET, more)
+    assert alone.share < 0.8 and asked
+    assert told.share == told.share_interval[1] == 1.0
+
+
 def coin_or_zeros():
     """Fails at a step whose coin (1e-4) is 1, or after 4 zeros in a row (.049 each) of six steps:
     (simulator, the `Modes` with a likeliest failure of each way, the share of the coin).

@@ -72,7 +72,8 @@ def mode_shares(
         modes: those that are known.
         budget: evaluations of the whole.
         more: from the failures [m] that are of none of the modes, where these have `SOME_OTHERS` of
-            the probability, to more modes, whose shares are told in their place.
+            the probability, to more modes, whose shares are told in their place. Where there are no
+            more, those failures lead to the modes that are known, and are counted as theirs.
 
     Returns:
         (`Modes`, whose shares are NaN where there was nothing to tell them from; draws that failed;
@@ -101,11 +102,14 @@ def mode_shares(
         paths = Paths(of_modes, 2 * most)  # so that the last ones are not cut short
         exact = _told_apart(paths, (points[0][some], points[1][some]), targets, most)
         told, spent = some[: len(exact)], spent + paths.spent
-        found = corrected_shares(nearest(points[0], targets[0]), told, exact, group, k)
-        others = told[exact == k]
+        near, others = nearest(points[0], targets[0]), told[exact == k]
+        found = corrected_shares(near, told, exact, group, k)
         if more is None or len(others) < SOME_OTHERS * len(told):
             return _with_shares(modes, *found), failing, spent
         modes, more = more(index_tree(episodes, others)), None
+        if len(modes) == k:  # they lead to those that are known
+            found = corrected_shares(near, told, np.where(exact < k, exact, near[told]), group, k)
+            return _with_shares(modes, *found), failing, spent
 
 
 def _told_apart(paths, failures, targets, most):
