@@ -7,8 +7,8 @@ from typing import Any
 import jax
 import numpy as np
 
-from jast._src.core.episode import replay, stacked
-from jast._src.core.failures import collect, identity, merge, rank
+from jast._src.core.episode import replay
+from jast._src.core.failures import collect, identity, merge
 from jast._src.core.rewards import Lexicographic, likelihood
 from jast._src.core.signature import signature_of
 from jast._src.core.simulator import Simulator
@@ -121,6 +121,6 @@ def _refined(
         new = index_tree(refined.failures.episodes, np.array(rows))
         where = np.full(len(rows), REFINED), np.array(rows)
         archive = merge(archive, collect(sim, reward, new, *where, seen=0, top=top), top=top)
-        if not best.failure or rank(stacked([archive.best, best]))[1] > 0:
+        if not best.failure or archive.best.reward > best.reward:
             best = jax.device_get(replay(sim, archive.best, reward=reward))
     return found._replace(best=best, failures=archive, refined=refined)
