@@ -470,7 +470,7 @@ def test_an_external_program():
     assert "received 'no answer'" in answered.message
 
 
-@pytest.mark.skipif(os.name != "posix", reason="elsewhere it is waited for")
+@pytest.mark.skipif(os.name != "posix", reason="a shell of POSIX")
 def test_a_program_is_not_waited_for_beyond_its_end():
     """A child keeps its outputs, of which a pipe holds a tenth."""
     much = "import sys; [f.write('x' * 10**6 + '\\n') for f in (sys.stdout, sys.stderr)]"
@@ -479,6 +479,13 @@ def test_a_program_is_not_waited_for_beyond_its_end():
     started = time.monotonic()
     assert blackbox.program(["sh", "-c", text])(np.zeros(2)) == (False, 2.5)
     assert time.monotonic() - started < 20
+
+
+def test_a_program_may_be_slow_to_read():
+    """Of 10,000 numbers, more than a pipe holds."""
+    text = "import json, sys, time; time.sleep(0.3); x = json.load(sys.stdin)['disturbances'];"
+    text += "print(json.dumps(dict(event=False, distance=len(x))))"
+    assert blackbox.program([sys.executable, "-c", text])(np.ones(10_000)) == (False, 10_000)
 
 
 def test_a_gymnasium_environment():

@@ -597,3 +597,37 @@ def test_a_step_may_change_its_own_state():
     states = [jast.replay(a, x).states["at"] for a in (sim, boxed())]
     np.testing.assert_array_equal(*states)
     assert shared == {"at": 0.0}
+
+
+@jax.tree_util.register_pytree_node_class
+class Copied:
+    """A pytree that makes its array anew whenever it is made."""
+
+    def __init__(self, at):
+        self.at = jnp.array(at) if isinstance(at, jax.Array) else at
+
+    def tree_flatten(self):
+        return (self.at,), None
+
+    @classmethod
+    def tree_unflatten(cls, _, children):
+        return cls(*children)
+
+
+def test_a_state_that_is_copied_is_not_changed():
+    jast.check(
+        boxed(
+            init=lambda x0: Copied(jnp.zeros(())),
+            step=lambda s, x: Copied(0.5 * s.at + 0.3 * x),
+            evaluate=lambda s: (s.at > 3, jnp.maximum(3 - s.at, 0.0)),
+        )
+    )
+
+
+def test_a_step_may_empty_its_own_state():
+    jast.check(boxed(step=lambda s, x: {"at": 0.5 * s.pop("at") + 0.3 * x}))
+
+
+def test_both_versions_leave_the_state_as_it_is():
+    with pytest.raises(ValueError, match="^evaluate: changes the state"):
+        jast.explain.regression(boxed(evaluate=far), boxed())

@@ -193,6 +193,20 @@ def test_failures_that_lead_to_the_known_modes_are_theirs(key):
     assert told.share == told.share_interval[1] == 1.0
 
 
+def test_shares_stay_with_their_modes_in_another_order(key):
+    """Above 3 (1.35e-3), below -3.2 (.69e-3), and what lies beside both, as near to either; `more`
+    has nothing for that but the two the other way round.
+    """
+    sim = limit_state(lambda u: jnp.min(jnp.stack([3 - u[0], 3.2 + u[0], 3.1 - u[1]])), 2)
+    heads = np.array([[3.001, 0], [-3.201, 0], [0, 3.101]])
+    q, (above, below) = mixture(sim, heads), known(sim, heads[:2])
+    found, *_ = mode_shares(
+        key, sim, q, Modes([above, below]), BUDGET, lambda others: Modes([below, above])
+    )
+    assert found[0].failure is below.failure and found[0].share < found[1].share
+    assert found[0].share + found[1].share == pytest.approx(1)
+
+
 def coin_or_zeros():
     """Fails at a step whose coin (1e-4) is 1, or after 4 zeros in a row (.049 each) of six steps:
     (simulator, the `Modes` with a likeliest failure of each way, the share of the coin).

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import jax
+
 from jast._src.core.simulator import Simulator, require_simulator
 from jast._src.runtime import host_errors
 
@@ -25,6 +27,7 @@ def incidents(sim: Simulator) -> tuple[host_errors.Incident, ...]:
         >>> jast.incidents.incidents(jast.simulators.walk1d())
         ()
     """
-    if not host_errors.runs_on_host(sim):
+    parts = jax.tree.leaves(sim, is_leaf=lambda part: isinstance(part, Simulator))
+    if not (host_errors.runs_on_host(sim) or any(isinstance(p, Simulator) for p in parts)):
         require_simulator("incidents", sim)
     return host_errors.incidents(sim)

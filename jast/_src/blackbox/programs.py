@@ -10,6 +10,7 @@ import shlex
 import shutil
 import subprocess
 import sys
+import tempfile
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -19,9 +20,6 @@ from jast._src.blackbox.worker import NAME, WrongAnswer, end_group
 from jast._src.core.typing import PathLike
 
 __all__ = ["program"]
-
-POLL = 0.05  # seconds between two looks whether a program has ended that keeps its outputs open
-PIPE = 2**20  # bytes that a pipe holds at most
 
 
 class Program(NamedTuple):
@@ -33,21 +31,33 @@ class Program(NamedTuple):
     def __call__(self, disturbances, x0=None):
         given = {"x0": x0, "disturbances": disturbances}
         task = json.dumps(given, default=lambda a: np.asarray(a).tolist())
-        pipes = dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.PIPE)
         running = getattr(sys.modules.get(NAME), "running", set())
-        # a session of its own, so that what the program has started can be ended with it
-        with subprocess.Popen(
-            self.command, **pipes, cwd=self.folder, start_new_session=True
-        ) as process:
-            running.add(process)
-            try:
-                written = _written(process, task.encode())
-            except BaseException:  # the time limit
-                end_group(process)
-                raise
-            finally:
-                running.discard(process)
-        out, errors = (text.decode("utf-8", "replace") for text in written)
+        # files: a pipe is open for as long as a child that the program leaves behind holds it
+        with (
+            tempfile.TemporaryFile() as asked,
+            tempfile.TemporaryFile() as told,
+            tempfile.TemporaryFile() as errors,
+        ):
+            asked.write(task.encode())
+            asked.seek(0)
+            # a session of its own, so that what the program has started can be ended with it
+            with subprocess.Popen(
+                self.command,
+                stdin=asked,
+                stdout=told,
+                stderr=errors,
+                cwd=self.folder,
+                start_new_session=True,
+            ) as process:
+                running.add(process)
+                try:
+                    process.wait()
+                except BaseException:  # the time limit
+                    end_group(process)
+                    raise
+                finally:
+                    running.discard(process)
+            out, errors = map(_text, (told, errors))
         if process.returncode:
             last = (errors.strip() or "no message on standard error").splitlines()[-1]
             raise RuntimeError(f"{self.command[0]}: exit status {process.returncode}: {last}")
@@ -115,24 +125,6 @@ def program(command: str | Sequence[str], *, folder: PathLike | None = None) -> 
     return Program(parts, None if folder is None else os.fspath(folder))
 
 
-def _written(process, task):
-    """What the program has written to its two outputs by its end: a child that it leaves may hold
-    them for longer.
-    """
-    while True:
-        ended = process.poll() is not None and os.name == "posix"
-        try:
-            return process.communicate(task, timeout=POLL)
-        except subprocess.TimeoutExpired as late:
-            if ended:
-                pipes = (process.stdout, late.output), (process.stderr, late.stderr)
-                return [(known or b"") + _waiting(pipe) for pipe, known in pipes]
-            task = None
-
-
-def _waiting(pipe):
-    """What can be read from ``pipe`` at once."""
-    if pipe.closed:
-        return b""
-    os.set_blocking(pipe.fileno(), False)
-    return pipe.read(PIPE) or b""
+def _text(file):
+    file.seek(0)
+    return file.read().decode("utf-8", "replace")

@@ -39,6 +39,7 @@ __all__ = ["ACTIONS", "OBSERVED", "check", "contract"]
 
 OBSERVED = 64  # numbers that ``observe`` may return at most to what looks at them, as networks do
 ARRAYS = (jax.Array, np.ndarray, np.generic, bool, int, float)
+LOOKS = {"disturbance", "evaluate", "is_terminal", "observe"}  # at a state that goes on
 LANES = 32  # nominal episodes that `check` runs: a handful, as a step may be slow
 HOSTED_LANES = 8  # of a system on the host, where each is dear
 ANEW = ", and initialize brings an object back to its start, whatever it did before"
@@ -203,6 +204,8 @@ def _trace(function, sim, actions, observed):
 def _call(name, function, *args):
     # containers of its own: what a step does to these is its own affair
     given = jax.tree.map(lambda a: a, args)
+    before = jax.tree.leaves(given)
+    looks = name in LOOKS and not _differ(before, given)  # a class may make its leaves anew
     try:
         found = function(*given)
     except Exception as e:
@@ -211,8 +214,7 @@ def _call(name, function, *args):
         kind = type(e).__name__
         hint = HINTS.get(kind, NO_START if name == "init" and args == ((),) else "")
         raise ValueError(f"{name}: raised {kind}{line_of(e)}: {_first_line(e)}{hint}") from e
-    kept = jax.tree.leaves(args), jax.tree.leaves(given)
-    if name != "step" and (len(kept[0]) != len(kept[1]) or any(map(operator.is_not, *kept))):
+    if looks and _differ(before, given):
         raise ValueError(
             f"{name}: changes the state that it is given, which others look at, too: it must leave"
             " it as it is, and make a new one, such as {**state, 'speed': 0.0}, where it needs one"
@@ -220,6 +222,12 @@ def _call(name, function, *args):
     if found is None and name in ("init", "step"):
         raise ValueError(f"{name}: returned None: is a return missing?")
     return found
+
+
+def _differ(before, tree):
+    """Whether the leaves of ``tree`` are other objects than ``before``."""
+    after = jax.tree.leaves(tree)
+    return len(after) != len(before) or any(map(operator.is_not, before, after))
 
 
 def _draw(name, dist):

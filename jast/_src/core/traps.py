@@ -90,7 +90,7 @@ def _program(
     leaves no slope; which leaves of the state they make random keys of.
     """
     x = D.sample(dist, jax.random.key(0))
-    program = jax.make_jaxpr(lambda s, x: (sim.step(s, x), sim.evaluate(s)))(state, x).jaxpr
+    program = jax.make_jaxpr(lambda s, x: (sim.evaluate(s), sim.step(s, x)))(state, x).jaxpr
     names = [equation.primitive.name for equation in _equations(program)]
     level = "stop_gradient" in names and _level(sim)
     leaves = jax.tree.leaves(state)

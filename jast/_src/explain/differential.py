@@ -9,12 +9,12 @@ import jax.numpy as jnp
 from jax.tree_util import Partial
 
 from jast import distributions as D
+from jast._src.core.check import contract
 from jast._src.core.signature import signature_of
 from jast._src.core.simulator import (
     Simulator,
     first_state,
     next_state,
-    require_simulator,
 )
 from jast._src.core.typing import Array, PRNGKey
 from jast._src.stress_testing.report import Report
@@ -109,7 +109,7 @@ def regression(sim_a: Simulator, sim_b: Simulator) -> Simulator:
 
 def _regression(caller, sim_a, sim_b):
     for sim in (sim_a, sim_b):
-        require_simulator(caller, sim)
+        contract(caller, sim)
     a, b = signature_of(sim_a), signature_of(sim_b)
     for part, one, other in (("disturbance", a.x, b.x), ("start", a.x0, b.x0)):
         if _shapes(one) != _shapes(other):

@@ -181,7 +181,7 @@ def simulate(
 
 
 def smooth_numbers(sim: Simulator) -> np.ndarray:
-    """Which of the numbers [D] make a float; the others make choices and counts."""
+    """Which of the numbers [D] make a float, by its dtype; the others make choices and counts."""
 
     def of(tree):
         each = [(count_numbers(s), jnp.issubdtype(s.dtype, jnp.floating)) for s in tree]

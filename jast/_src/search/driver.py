@@ -254,10 +254,10 @@ def finish(
         times = dict(zip(zip(trees.tolist(), numbers.tolist()), counts, strict=True))
         where = zip(found.tree.tolist(), found.simulation.tolist())
         found = found._replace(counts=np.array([times[each] for each in where], np.int32))
-    best = jax.device_get(replay(sim, best, reward=reward))
     # of equal ones the first that was simulated, as inside of a transformation
     if found.size and not (best.failure and best.reward >= found.best.reward):
-        best = jax.device_get(replay(sim, found.best, reward=reward))
+        best = found.best
+    best = jax.device_get(replay(sim, best, reward=reward))
     return SearchResult(
         best=best,
         best_reward_per_tree=log.history.best_reward[-1],

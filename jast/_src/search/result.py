@@ -98,7 +98,7 @@ class SearchResult(NamedTuple):
 
     best: Episode
     """The best episode: the failure of the highest reward, or the episode of the highest reward
-    where none failed; with its states.
+    where none failed; of equal ones the first that was found. With its states.
     """
     best_reward_per_tree: Any
     """[trees] float: reward of each tree's best episode, likewise; -inf where the simulator

@@ -95,7 +95,7 @@ def mode_shares(
     points = place(episodes)
     step = max(len(z) // MAX_PATH_FAILURES, 1)
     some = numpy_generator(key, 1).permutation(np.arange(step // 2, len(z), step))
-    spent += len(z)
+    spent, before = spent + len(z), 0
     while True:
         targets, k = place(stacked(m.failure for m in modes)), len(modes)
         most = _paths_budget(budget, k)
@@ -103,13 +103,12 @@ def mode_shares(
         exact = _told_apart(paths, (points[0][some], points[1][some]), targets, most)
         told, spent = some[: len(exact)], spent + paths.spent
         near, others = nearest(points[0], targets[0]), told[exact == k]
-        found = corrected_shares(near, told, exact, group, k)
+        if k <= before:  # they lead to those that are known
+            exact = np.where(exact < k, exact, near[told])
         if more is None or len(others) < SOME_OTHERS * len(told):
+            found = corrected_shares(near, told, exact, group, k)
             return _with_shares(modes, *found), failing, spent
-        modes, more = more(index_tree(episodes, others)), None
-        if len(modes) == k:  # they lead to those that are known
-            found = corrected_shares(near, told, np.where(exact < k, exact, near[told]), group, k)
-            return _with_shares(modes, *found), failing, spent
+        before, modes, more = k, more(index_tree(episodes, others)), None
 
 
 def _told_apart(paths, failures, targets, most):

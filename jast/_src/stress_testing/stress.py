@@ -103,7 +103,8 @@ FALSIFY_SHARE = 0.2
 follow; below `MIN_DIVIDED_BUDGET` all of it may."""
 OTHERS_SHARE = 0.025
 """Share of the budget, beyond it, by which failures of the estimate are refined that are of no mode
-known, where these are more than a few."""
+known, where these are more than a few. Modes are then told apart once more, and so are their
+shares: together up to some 15 % of the budget."""
 LEAST_REFINED = 100  # evaluations that `refine` takes at least
 REFINED_FACTOR = 8  # failures that refinement starts from for each that is returned
 FOUND_FACTOR = 4  # failures of one explorer for each that is returned

@@ -299,7 +299,7 @@ def _invalid(result):
     estimate = _estimate_of(result)
     if isinstance(estimate, Estimate) and estimate.plain is not None:
         _, invalid, n = estimate.plain
-        return n * (invalid == n and math.isnan(estimate.mean))
+        return estimate.invalid * (invalid == n and math.isnan(estimate.mean))
     searched = isinstance(result, SearchResult) and not np.isfinite(result.best.reward)
     counted = isinstance(result, Nominal) and result.invalid == result.episodes
     return result.invalid if searched or counted else 0

@@ -123,7 +123,7 @@ class Modes(tuple):
                 f" {mode.members:8d} {mode.share_words:>{wide}}"
             )
         if round(100 * self.others) > 0:
-            lines.append(f"failures of no mode above {100 * self.others:{18 + wide}.0f} %")
+            lines.append(f"failures of no mode above {100 * self.others:{17 + wide}.0f} %")
         return "\n".join(lines)
 
     __repr__ = __str__
