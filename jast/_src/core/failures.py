@@ -40,8 +40,6 @@ __all__ = [
     "to_numpy",
 ]
 
-ROUNDING = 8  # units of the last digit by which sums of as likely disturbances may differ
-
 
 @display.printable("seen")
 @jax.tree_util.register_dataclass
@@ -383,21 +381,13 @@ def identity(episode):
 
 
 def rank(episodes: Episode) -> np.ndarray:
-    """The place of each of ``episodes`` [n], 0 for the best: by falling reward, and of rewards that
-    differ by no more than rounding by falling log p; equal in both is the same place.
+    """The place of each of ``episodes`` [n], 0 for the best: by falling reward, and of equal ones
+    by falling log p; equal in both is the same place.
 
-    Of a fair coin, and of every longer episode whose further steps are modes, log p relative to the
-    mode is the same: the likeliest of them is that of the fewest steps.
+    Of a fair coin log p relative to the mode is the same for all: the likeliest is the shortest.
     """
-    reward, log_p = np.asarray(episodes.reward), np.asarray(episodes.log_prob)
-    order = np.argsort(-reward, kind="stable")
-    above, below = reward[order][:-1], reward[order][1:]
-    with np.errstate(invalid="ignore"):  # of those that are infinite
-        equal = (above == below) | (above - below <= ROUNDING * np.spacing(np.abs(below)))
-    level = np.zeros(len(order))
-    level[order[1:]] = np.cumsum(~equal)
-    _, place = np.unique(np.stack([level, -log_p], axis=1), axis=0, return_inverse=True)
-    return place.reshape(-1)
+    keys = np.stack([-np.asarray(episodes.reward), -np.asarray(episodes.log_prob)], axis=1)
+    return np.unique(keys, axis=0, return_inverse=True)[1].reshape(-1)
 
 
 def _best(caller, failures, top):
