@@ -520,8 +520,8 @@ class _StressTest:
         rest = max(rest, few_calls.LEAST)
         p = failure_probability(self.next_key(), self.sim, rest, failures=failures, **places)
         self.keep_probability(p, "probability")
-        short = self.budget - self.spent < shares_cost(self.budget, len(self.modes))
-        short = short and self.hosted
+        left = self.budget - self.spent
+        short = self.hosted and left < shares_cost(self.budget, len(self.modes))
         if p.proposal is None or short:
             return
         if not len(self.pool):
