@@ -13,7 +13,11 @@ from systems import dice, line, ring, walk
 import jast
 from jast import distributions as D
 from jast._src.core import traps as T
-from jast._src.core.traps import traps
+from jast._src.core.probe import probe
+
+
+def traps(sim):
+    return T.traps(sim, probe(sim).resolution)
 
 
 def told(sim, words):

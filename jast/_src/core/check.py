@@ -11,7 +11,6 @@ from __future__ import annotations
 import math
 import operator
 import warnings
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -21,29 +20,24 @@ from jax import lax
 from jast import distributions as D
 from jast._src.core.actions import Quantiles, Samples, UniformBox, Wide
 from jast._src.core.lost_failures import warn_of_lost_failures
-from jast._src.core.signature import signature_of
+from jast._src.core.probe import probe
 from jast._src.core.simulator import (
     Simulator,
     first_state,
-    next_state,
     require_simulator,
 )
 from jast._src.core.traps import traps
-from jast._src.core.typing import Actions, Array, ArrayTree
+from jast._src.core.typing import Actions
 from jast._src.runtime._jax import is_traced, is_tracing, quick
 from jast._src.runtime.host_errors import incidents, new_incidents, runs_on_host
 from jast._src.runtime.memory import release
-from jast._src.util.pytrees import index_tree, select, with_rows_of
 
 __all__ = ["ACTIONS", "OBSERVED", "check", "contract"]
 
 OBSERVED = 64  # numbers that ``observe`` may return at most to what looks at them, as networks do
 ARRAYS = (jax.Array, np.ndarray, np.generic, bool, int, float)
 LOOKS = {"disturbance", "evaluate", "is_terminal", "observe"}  # at a state that goes on
-LANES = 32  # nominal episodes that `check` runs: a handful, as a step may be slow
-HOSTED_LANES = 8  # of a system on the host, where each is dear
 ANEW = ", and initialize brings an object back to its start, whatever it did before"
-STEPS = 8  # of each, where the system is not episodic
 DRAWS = 64  # of the actions at the start
 HINTS = {
     "TracerBoolConversionError": (
@@ -70,12 +64,11 @@ ACTIONS = {
 def check(sim: Simulator, actions: Actions | None = None) -> Simulator:
     """Whether a simulator keeps its contract: every function is traced and a few steps are run.
 
-    Runs 33 episodes of an episodic system, and the first steps of any other (9 of a system on the
-    host, and one twice). Where ``sim`` holds
-    tracers, or inside a transformation of JAX, only the traced half runs. Warns (UserWarning) where
-    objects of `jast.blackbox` that are judged at the end only (``episodic=True``) failed on the way
-    in some of 16 more episodes, and of what fits together and loses failures all the same (up to 80
-    episodes of at most 500 steps; not of a system on the host):
+    Runs 81 episodes, of at most 500 steps where the system is not episodic (9 of a system on the
+    host, and one twice). Where ``sim`` holds tracers, or inside a transformation of JAX, only the
+    traced half runs. Warns (UserWarning) where objects of `jast.blackbox` that are judged at the
+    end only (``episodic=True``) failed on the way in some of 16 more episodes, and of what fits
+    together and loses failures all the same (not of a system on the host):
 
      - the floats of the state are too coarse for what a disturbance does to it, or no disturbance
        changes a number of the state;
@@ -109,7 +102,7 @@ def check(sim: Simulator, actions: Actions | None = None) -> Simulator:
         return sim
     before = incidents(sim)
     try:
-        found = jax.device_get(_probe(sim, actions))
+        found = probe(sim)
     except jax.errors.JaxRuntimeError as e:  # a host callback that raised
         raise ValueError(
             f"check: while the first steps ran, a function of the simulator raised {_first_line(e)}"
@@ -124,16 +117,17 @@ def check(sim: Simulator, actions: Actions | None = None) -> Simulator:
                 f"evaluate: {incident.message}: randomness belongs in disturbance or start{ANEW}"
             )
     _check_twice("step", lambda x0, x: sim.step(first_state(sim, x0), x), found.x0, found.x)
-    for words in traps(sim):
+    for words in [] if runs_on_host(sim) else traps(sim, found.resolution):
         warnings.warn(f"check: {words}", UserWarning, stacklevel=2)
     warn_of_lost_failures(sim)
-    if actions is not None and found.impossible > 0.5:
+    share = 0.0 if actions is None else _impossible_share(sim, actions, found.x0)
+    if share > 0.5:
         box = ""
         if isinstance(actions, UniformBox):
             box = f" on the box [{_show(actions.low)}, {_show(actions.high)}]"
         raise ValueError(
             f"{_name(actions)}: expected disturbances inside the support of p(x | s), received log"
-            f" densities that are not finite in {found.impossible:.0%} of {DRAWS} draws at the"
+            f" densities that are not finite in {share:.0%} of {DRAWS} draws at the"
             f" start{box}"
         )
     return sim
@@ -319,102 +313,16 @@ def _box(box, x):
                 )
 
 
-class _Probe(NamedTuple):
-    """The numbers that `check` judges, of L episodes, the last one undisturbed, at T states."""
-
-    has_mode: bool
-    """Whether there is an undisturbed episode."""
-    density: Array
-    """bool [L, T]: the log density of the disturbance that led there is not finite."""
-    state: ArrayTree
-    """bool [L, T]: a leaf of the state holds NaN."""
-    distance: Array
-    """bool [L, T]: the miss distance is not finite."""
-    x0: ArrayTree
-    """Of the first episode."""
-    x: ArrayTree
-    """Its first disturbance."""
-    judged: ArrayTree
-    """A state of it that is evaluated."""
-    impossible: Array | None
-    """Share of the actions' draws at the start whose log density is not finite."""
-
-
 @quick
-def _probe(sim, actions):
-    """LANES nominal episodes (HOSTED_LANES) and the undisturbed one, STEPS steps of each (all, of
-    an episodic system).
-    """
-    signature = signature_of(sim)
-    has_mode = signature.start.mode and signature.disturbance.mode
+def _impossible_share(sim, actions, x0):
+    """Of the ``actions``' draws at the start, those whose log density is not finite."""
 
-    def episode(key, undisturbed):
-        def choose(dist, t):
-            drawn = D.sample(dist, jax.random.fold_in(key, t))
-            if not has_mode:
-                return drawn
-            return jax.tree.map(
-                lambda mode, x: jnp.where(undisturbed, jnp.asarray(mode, x.dtype), x),
-                D.mode(dist),
-                drawn,
-            )
+    def impossible(key):
+        dist = sim.disturbance(first_state(sim, x0))
+        return ~jnp.isfinite(dist.log_prob(actions.draw(key, dist)))
 
-        def look(state):
-            """Whether the episode ends, which leaves are NaN, whether the distance is wrong."""
-            event = wrong = jnp.zeros((), bool)
-            if not sim.episodic:  # such a system is judged at its end, below
-                event, distance, *_ = sim.evaluate(state)
-                wrong = ~jnp.isfinite(distance)
-            ends = jnp.asarray(event) | jnp.asarray(sim.is_terminal(state))
-            return ends, (jax.tree.map(_any_nan, state), wrong)
-
-        def step(carry, t):
-            state, done = carry
-            dist = sim.disturbance(state)
-            x = choose(dist, t)
-            after = next_state(sim, state, x)
-            ends, flags = look(after)
-            flags = (~jnp.isfinite(dist.log_prob(x)), *flags)
-            flags = jax.tree.map(lambda f: f & ~done, flags)
-            return (select(done, state, after), done | ends), (flags, x)
-
-        start = sim.start()
-        x0 = choose(start, 0)
-        first = first_state(sim, x0)
-        done, flags = look(first)
-        steps = sim.horizon if sim.episodic else min(sim.horizon, STEPS)
-        begun = with_rows_of(undisturbed, (first, jnp.zeros((), bool)))
-        times = jnp.arange(1, steps + 1, dtype=jnp.int32)
-        (last, _), (later, xs) = lax.scan(step, begun, times)
-        flags = (~jnp.isfinite(start.log_prob(x0)), *flags)
-        density, nan, distance = jax.tree.map(
-            lambda a, b: jnp.concatenate([a[None], b]), flags, later
-        )
-        if sim.episodic:
-            distance = distance.at[-1].set(~jnp.isfinite(sim.evaluate(last)[1]))
-        x = index_tree(xs, 0)
-        # a black box has kept what it says of the start
-        judged = last if sim.episodic or runs_on_host(sim) else first
-        return (density, nan, distance), (x0, x, judged)
-
-    lanes = HOSTED_LANES if runs_on_host(sim) else LANES
-    keys = jax.random.split(jax.random.key(0), lanes + 1)
-    flags, values = jax.vmap(episode)(keys, jnp.arange(lanes + 1) == lanes)
-    x0, x, judged = index_tree(values, 0)
-    share = None
-    if actions is not None:
-
-        def impossible(key):
-            dist = sim.disturbance(first_state(sim, x0))
-            return ~jnp.isfinite(dist.log_prob(actions.draw(key, dist)))
-
-        drawn = jax.vmap(impossible)(jax.random.split(jax.random.key(1), DRAWS))
-        share = jnp.mean(drawn, dtype=jnp.float32)
-    return _Probe(has_mode, *flags, x0=x0, x=x, judged=judged, impossible=share)
-
-
-def _any_nan(a):
-    return jnp.any(jnp.isnan(a)) if jnp.issubdtype(a.dtype, jnp.inexact) else jnp.zeros((), bool)
+    drawn = jax.vmap(impossible)(jax.random.split(jax.random.key(1), DRAWS))
+    return jnp.mean(drawn, dtype=jnp.float32)
 
 
 def _check_densities(found):

@@ -10,10 +10,10 @@ from jax import lax
 from jax.custom_derivatives import SymbolicZero
 
 from jast import distributions as D
-from jast._src.core.float_resolution import Probe, describe, probe
+from jast._src.core.float_resolution import describe
+from jast._src.core.probe import Resolution
 from jast._src.core.signature import per_simulator, signature_of
 from jast._src.core.simulator import Simulator, first_state, next_state
-from jast._src.runtime.host_errors import runs_on_host
 from jast._src.util.pytrees import Key
 
 __all__ = ["traps"]
@@ -28,13 +28,11 @@ CALLS = {"jit", "pjit", "closed_call", "custom_jvp_call", "custom_vjp_call", "re
 """Primitives whose inputs and outputs are those of the program in them, as JAX names them."""
 
 
-def traps(sim: Simulator) -> list[str]:
-    """What loses failures, or minutes, of a simulator that keeps its contract: a text each, which
-    names the function at fault. None for a system on the host. Runs 80 episodes at most.
+def traps(sim: Simulator, seen: Resolution) -> list[str]:
+    """What loses failures, or minutes, of a simulator that keeps its contract, not on the host, by
+    its ``resolution``: a text each, which names the function at fault.
     """
-    if runs_on_host(sim):
-        return []
-    seen, signature, (equations, level, keys) = probe(sim), signature_of(sim), _program(sim)
+    signature, (equations, level, keys) = signature_of(sim), _program(sim)
     found = [f"step: {text}" for text in (describe(seen), _jumps(seen)) if text is not None]
     found += _fixed_keys(signature.state, seen, keys)
     if seen.distance_differs and level:
@@ -53,7 +51,7 @@ def traps(sim: Simulator) -> list[str]:
     return found
 
 
-def _jumps(seen: Probe) -> str | None:
+def _jumps(seen: Resolution) -> str | None:
     if not seen.jump:
         return None
     return (
@@ -69,7 +67,7 @@ def _is_ours(leaf: Any) -> bool:
     return isinstance(leaf, Key)
 
 
-def _fixed_keys(state: Any, seen: Probe, keys: tuple[bool, ...]) -> Iterator[str]:
+def _fixed_keys(state: Any, seen: Resolution, keys: tuple[bool, ...]) -> Iterator[str]:
     """A text for each of the leaves that are ``keys`` and that no disturbance reaches."""
     leaves = jax.tree_util.tree_leaves_with_path(state, is_leaf=_is_ours)
     for (path, leaf), key, still in zip(leaves, keys, seen.unmoved, strict=True):
@@ -90,7 +88,7 @@ def _program(
     leaves no slope; which leaves of the state they make random keys of.
     """
     x = D.sample(dist, jax.random.key(0))
-    program = jax.make_jaxpr(lambda s, x: (sim.evaluate(s), sim.step(s, x)))(state, x).jaxpr
+    program = jax.make_jaxpr(lambda s, x: (sim.evaluate(s), next_state(sim, s, x)))(state, x).jaxpr
     names = [equation.primitive.name for equation in _equations(program)]
     level = "stop_gradient" in names and _level(sim)
     leaves = jax.tree.leaves(state)

@@ -11,16 +11,15 @@ from jax.tree_util import Partial
 from jast import distributions as D
 from jast._src.core.check import contract
 from jast._src.core.signature import signature_of
-from jast._src.core.simulator import (
-    Simulator,
-    first_state,
-    next_state,
-)
+from jast._src.core.simulator import Simulator, first_state, next_state
 from jast._src.core.typing import Array, PRNGKey
+from jast._src.runtime._jax import quick
 from jast._src.stress_testing.report import Report
 from jast._src.util.pytrees import select, with_strong_types
 
 __all__ = ["differential", "regression"]
+
+LEAST_QUIET = 1e-3  # miss distance where both fail, at least: it is no failure
 
 
 class Side(NamedTuple):
@@ -121,7 +120,7 @@ def _regression(caller, sim_a, sim_b):
         init=Partial(_init, sim_a, sim_b),
         step=Partial(_step, sim_a, sim_b),
         disturbance=Partial(_disturbance, sim_a, sim_b),
-        evaluate=Partial(_evaluate, sim_b),
+        evaluate=Partial(_evaluate, _quiet(sim_b)),
         horizon=max(sim_a.horizon, sim_b.horizon),
         start=sim_b.start,
         is_terminal=_is_terminal,
@@ -175,13 +174,13 @@ def _is_terminal(state):
     return a.failed | (b.over & ~b.failed) | (a.over & b.over)
 
 
-def _evaluate(sim_b, state):
+def _evaluate(quiet, state):
     event = state.b.failed & state.a.over & ~state.a.failed
     both = state.b.failed & ~event
-    quiet = jnp.maximum(_quiet(sim_b).astype(state.nearest.dtype), 1e-3)
-    return event, jnp.where(both, quiet, state.nearest)
+    return event, jnp.where(both, quiet.astype(state.nearest.dtype), state.nearest)
 
 
+@quick
 def _quiet(sim):
     """The miss distance of the start at its mode; of an episodic system, that of the undisturbed
     episode (of one of seed 0 where there is no mode).
@@ -198,7 +197,8 @@ def _quiet(sim):
     calm = signature.start.mode and signature.disturbance.mode
     state = first_state(sim, likely(sim.start()))
     steps = sim.horizon if sim.episodic else 0
-    return jnp.abs(sim.evaluate(jax.lax.fori_loop(0, steps, move, state))[1])
+    distance = sim.evaluate(jax.lax.fori_loop(0, steps, move, state))[1]
+    return jnp.maximum(jnp.abs(distance), LEAST_QUIET)
 
 
 def _observe(sim_a, sim_b, state):

@@ -201,25 +201,26 @@ def stress(
         budget = checks.whole_number(name, "budget", budget, MIN_BUDGET)
     top = checks.whole_number(name, "top", top, 1)
     require_simulator(name, sim)
-    check(sim)
-    by_default = budget is None and seconds is None and checkpoint is None
-    if budget is None and seconds is None and not has_quantiles(sim):
-        budget = DEFAULT_BUDGET
-    if budget is None:
-        budget = budgets.measure_budget(name, key, sim, seconds, MIN_BUDGET, DEFAULT_BUDGET)
-    about = dict(top=top, progress=progress, callback=callback, checkpoint=checkpoint)
-    about |= dict(placement=work.placement(name, executor, devices), by_default=by_default)
-    report, more = _stress_once(key, sim, budget, **about)
-    while more is not None:
-        interrupted = f"while it was made again with {more} evaluations"
-        try:
-            again, more = _stress_once(key, sim, more, **about)
-        except KeyboardInterrupt:
-            again = None
-        if again is None or again.probability is None:  # the first answer is not lost
-            return report._replace(settings=report.settings | dict(interrupted=interrupted))
-        report = again
-    return report
+    with runs_apart(sim):  # so that the same call is the same, whatever ran before
+        check(sim)
+        by_default = budget is None and seconds is None and checkpoint is None
+        if budget is None and seconds is None and not has_quantiles(sim):
+            budget = DEFAULT_BUDGET
+        if budget is None:
+            budget = budgets.measure_budget(name, key, sim, seconds, MIN_BUDGET, DEFAULT_BUDGET)
+        about = dict(top=top, progress=progress, callback=callback, checkpoint=checkpoint)
+        about |= dict(placement=work.placement(name, executor, devices), by_default=by_default)
+        report, more = _stress_once(key, sim, budget, **about)
+        while more is not None:
+            interrupted = f"while it was made again with {more} evaluations"
+            try:
+                again, more = _stress_once(key, sim, more, **about)
+            except KeyboardInterrupt:
+                again = None
+            if again is None or again.probability is None:  # the first answer is not lost
+                return report._replace(settings=report.settings | dict(interrupted=interrupted))
+            report = again
+        return report
 
 
 def _stress_once(key, sim, budget, *, top, progress, callback, checkpoint, placement, by_default):
@@ -229,7 +230,6 @@ def _stress_once(key, sim, budget, *, top, progress, callback, checkpoint, place
     name, more = "stress", None
     settings = call_settings(name, key, budget=budget, top=top)
     with (
-        runs_apart(sim),  # so that the same call is the same, whatever ran before
         open_checkpoint(name, checkpoint, key, sim=sim, budget=budget, top=top) as store,
         keep_answers(store),
         briefly(not budgets.uses_populations(sim, budget)),
