@@ -200,7 +200,7 @@ def test_weights_average_to_one(mixed, key, gates):
     dtype = normal_numbers(mixed)
     rng = np.random.default_rng(0)
     one = jax.tree.map(lambda a: 0.15 * rng.standard_normal(np.shape(a)), f.model)
-    one = one._replace(floor=-np.inf)
+    one = one._replace(floor=-np.inf, kept=0.2)
     if gates == 1:
         one.first.scales[:], one.steps.scales[:] = 0, 0
     tilts = [f.model, one, f.model._replace(floor=np.log(0.3))]

@@ -112,6 +112,14 @@ class SearchSettings(NamedTuple):
     """Share of wide components, under which no weight is without variance."""
     defensive_scale: float = 0.75
     """Factor on the coefficients of a tilt in its defensive copy."""
+    kept_choices: float = 0.5
+    """Choices of an episode, in the mean, that a tilt leaves as the model has them, so that one odd
+    choice costs no weight of hundreds. Of ten keys, 20,000 evaluations: root mean square error of a
+    rare coin beside a run of one face 2.4 -> 1.6 %, of components 1.4 -> 1.05 %; the worst of 40
+    reliable answers of four more systems 3.0 -> 2.7 standard errors. A whole choice costs dice, all
+    of which matter, 40 % of their standard error; a half 15 %."""
+    kept_share_most: float = 0.2
+    """Of each choice, at most."""
     rare_probability: float = 1e-4
     """Probability below which a proposal of Gaussians needs no share of the model."""
     variance_least: float = 0.3

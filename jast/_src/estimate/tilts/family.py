@@ -110,6 +110,13 @@ class TiltFamily(NamedTuple):
         return int(min(max(self.budget // BATCHES, small), most))
 
     @property
+    def kept(self) -> float:
+        """The part of each choice that a tilt leaves as the model has it."""
+        first, steps, _ = self.about
+        n = max(first.choices + self.sim.horizon * steps.choices, 1)
+        return min(self.settings.kept_choices / n, self.settings.kept_share_most)
+
+    @property
     def model(self) -> Tilt:
         """The model as a tilt."""
         return model_tilt(self.about, self.components_each)
@@ -224,7 +231,8 @@ class TiltFamily(NamedTuple):
             power = tempering_power(own, min(s.tempered_size, TEMPERED_PART * part.sum()))
             v = np.exp(power * (own - own.max()))
             one = fit_tilt(rows, v, effective_sample_size(power * own), model)
-            tilts += [one, scale_tilt(one, s.defensive_scale)]
+            one = one._replace(kept=self.kept)
+            tilts += [one, scale_tilt(one, s.defensive_scale)._replace(kept=self.kept)]
             weights += [mass * (1 - s.model_share - wide), mass * wide]
         return Mixture(tilts, weights, frame)
 

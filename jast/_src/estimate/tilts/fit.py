@@ -65,6 +65,7 @@ class Tilt(NamedTuple):
     first: Block
     steps: Block
     floor: float = -np.inf
+    kept: float = 0.0
 
 
 class Rows(NamedTuple):
@@ -332,12 +333,13 @@ def log_ratios(tilts: list[Tilt], rows: tuple[Rows, Rows], n: int) -> np.ndarray
 
     def of_tilt(tilt):
         each = zip(rows, tilt[:2], strict=True)
-        return sum(np.bincount(r.trace, _log_ratio(b, r, tilt.floor), minlength=n) for r, b in each)
+        ratios = ((r.trace, _log_ratio(b, r, tilt.floor, tilt.kept)) for r, b in each)
+        return sum(np.bincount(trace, ratio, minlength=n) for trace, ratio in ratios)
 
     return np.stack([of_tilt(tilt) for tilt in tilts], axis=1)
 
 
-def _log_ratio(block, rows, floor):
+def _log_ratio(block, rows, floor, kept):
     """log q - log p [N] of each row."""
     out = np.zeros(len(rows.x), rows.x.dtype)
     for a in range(rows.normals.shape[1]):
@@ -351,7 +353,9 @@ def _log_ratio(block, rows, floor):
         log_q = np.where(log_p > -np.inf, np.maximum(log_p, floor), -np.inf)
         log_q = log_q + _choice_features(rows, j) @ block.shifts[:, j]
         at = np.arange(len(log_p)), rows.choices[:, j]
-        out += log_q[at] - log_sum(log_q) - log_p[at]
+        gain = log_q[at] - log_sum(log_q) - log_p[at]
+        with np.errstate(divide="ignore"):
+            out += np.logaddexp(np.log1p(-kept) + gain, np.log(kept))
     return out
 
 
@@ -380,7 +384,7 @@ def of_tilts(q: Tilts) -> tuple[list[Tilt], np.ndarray, Frame]:
     q = jax.tree.map(lambda a: np.asarray(a, np.float64), q)
     weights = np.exp(q.log_weights)
     used = np.flatnonzero(weights)
-    components = Tilt(q.first, q.steps, q.floors)
+    components = Tilt(q.first, q.steps, q.floors, np.broadcast_to(q.kept, q.floors.shape))
     return [jax.tree.map(itemgetter(int(k)), components) for k in used], weights[used], q.frame
 
 
@@ -400,5 +404,6 @@ def as_tilts(
         first=stacked.first,
         steps=stacked.steps,
         frame=frame,
+        kept=stacked.kept,
     )
     return jax.tree.map(lambda a: np.asarray(a, dtype), q)

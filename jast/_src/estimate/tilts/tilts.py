@@ -108,6 +108,8 @@ class Tilts(NamedTuple):
     """Of x0, by one feature that is 1"""
     steps: Block
     frame: Frame
+    kept: ArrayLike = 0.0
+    """[K] the part of each choice that is left as the model has it"""
 
 
 class Numbers(NamedTuple):
@@ -232,11 +234,14 @@ def interval_starts(p: jax.Array) -> jax.Array:
     return jnp.sum(jnp.where(before, p[:, None, :], 0), axis=2)
 
 
-def tilt_log_probabilities(log_p: jax.Array, shifts: jax.Array, floors: jax.Array) -> jax.Array:
+def tilt_log_probabilities(
+    log_p: jax.Array, shifts: jax.Array, floors: jax.Array, kept: jax.Array
+) -> jax.Array:
     """Log probabilities [K, B, C] of choices of ``log_p`` [B, C] under each tilt."""
-    log_p = log_p[None]
-    lifted = jnp.where(log_p > -jnp.inf, jnp.maximum(log_p, floors[:, None, None]), -jnp.inf)
-    return jax.nn.log_softmax(lifted + shifts, axis=-1)
+    log_p, floors, kept = log_p[None], floors[:, None, None], kept[:, None, None]
+    lifted = jnp.where(log_p > -jnp.inf, jnp.maximum(log_p, floors), -jnp.inf)
+    log_q = jax.nn.log_softmax(lifted + shifts, axis=-1)
+    return jnp.logaddexp(jnp.log1p(-kept) + log_q, jnp.log(kept) + log_p)
 
 
 def count_rare_before(log_p: Array, i: Array, np: ModuleType = jnp) -> Array:
@@ -254,14 +259,14 @@ def _owner_one_hot(owners, size, i):
     return at[:, None] == jnp.arange(size, dtype=jnp.int32)[None]
 
 
-def _draw_step(p, k, f, block, floors, numbers):
+def _draw_step(p, k, f, block, odds, numbers):
     """(x, z [A], i [B], log probabilities [B, C], log q_k - log p [K]) of one draw of tilt k."""
     e, h, v = numbers
     log_p = stack_choices(p).astype(e.dtype)
-    ratio = jnp.zeros(len(floors), e.dtype)
+    ratio = jnp.zeros(len(odds[0]), e.dtype)
     i = jnp.zeros((0,), jnp.int32)
     if p.choices:
-        i, gain = _draw_choices(log_p, k, f, block, floors, v)
+        i, gain = _draw_choices(log_p, k, f, block, odds, v)
         ratio = ratio + gain
     z = e
     if p.normals:
@@ -270,7 +275,7 @@ def _draw_step(p, k, f, block, floors, numbers):
     return assemble(p, z, i), z, i, log_p, ratio
 
 
-def _draw_choices(log_p, k, f, block, floors, v):
+def _draw_choices(log_p, k, f, block, odds, v):
     """Categories [B] by tilt k at uniform numbers ``v`` [B], and log q_k - log p [K]."""
     dtype = log_p.dtype
     y = f[FIRST_STATE_FEATURE] if len(f) > FIRST_STATE_FEATURE else f[0]
@@ -281,7 +286,7 @@ def _draw_choices(log_p, k, f, block, floors, v):
         b_log_p, b_base, b_extra, b_v = row
         three = jnp.stack([r, r * r, r * y])
         shift = (b_base + three @ b_extra)[None, None]
-        log_q = tilt_log_probabilities(b_log_p[None], shift, floors[k][None])
+        log_q = tilt_log_probabilities(b_log_p[None], shift, *(a[k][None] for a in odds))
         c = choose_categories(log_q[0], b_v[None])[0]
         return r + jnp.where(b_log_p[c] < math.log(RARE), 1.0, 0.0).astype(dtype), c
 
@@ -289,7 +294,8 @@ def _draw_choices(log_p, k, f, block, floors, v):
     _, i = lax.scan(choose, jnp.zeros((), dtype), rows, unroll=len(v) <= UNROLLED)
     r = count_rare_before(log_p, i).astype(dtype)
     three = jnp.stack([r, r * r, r * y])
-    log_q = tilt_log_probabilities(log_p, base + jnp.einsum("xb,kxbc->kbc", three, extra), floors)
+    shifts = base + jnp.einsum("xb,kxbc->kbc", three, extra)
+    log_q = tilt_log_probabilities(log_p, shifts, *odds)
 
     def at_chosen(a):
         return jnp.take_along_axis(a, i[..., None], axis=-1)[..., 0]
@@ -364,17 +370,18 @@ def _simulate(sim, q, u, first, noise):
     live = jnp.sum(jnp.isfinite(q.log_weights))
     k = jnp.minimum(jnp.sum(u[:, None] >= edges[None], axis=1), live - 1)
     horizon, density, about = sim.horizon, likelihood(sim), shape(sim)
+    odds = q.floors, jnp.broadcast_to(q.kept, jnp.shape(q.floors))
 
     def start(k, *numbers):
         one = jnp.ones(1, u.dtype)
-        x0, *row, ratio = _draw_step(parts(sim.start()), k, one, q.first, q.floors, numbers)
+        x0, *row, ratio = _draw_step(parts(sim.start()), k, one, q.first, odds, numbers)
         return begin(sim, density, x0), ratio, row
 
     def advance_one(progress, ratio, length, k, numbers, t):
         seen = tilt_inputs(sim, progress.state)
         f = features(q.frame, seen, t.astype(u.dtype) / horizon)
         p = parts(sim.disturbance(progress.state))
-        x, *row, gain = _draw_step(p, k, f, q.steps, q.floors, numbers)
+        x, *row, gain = _draw_step(p, k, f, q.steps, odds, numbers)
         after = advance(sim, density, progress, x, t + 1 >= horizon)
         done = progress.done
         after, ratio = select(done, (progress, ratio), (after, ratio + gain))
