@@ -28,7 +28,7 @@ from jast._src.estimate.proposal_search.mixture_draws import resample
 from jast._src.normal_space.mode_coordinates import centred
 from jast._src.normal_space.transform import dimension, normal_numbers, policy_of
 from jast._src.stress_testing import explorers
-from jast._src.stress_testing import stress as portfolio
+from jast._src.stress_testing import stress_test as portfolio
 from jast.rewards import likelihood
 
 __all__ = ["METHODS", "run"]

@@ -33,7 +33,7 @@ from jast._src.estimate.population.particle_moves import (
 )
 from jast._src.estimate.population.search import Answer, answer_of
 from jast._src.normal_space.transform import episodes, outcomes
-from jast._src.stress_testing import stress
+from jast._src.stress_testing import stress_test
 from jast._src.util.intervals import clopper_pearson
 from jast.estimate import failure_probability, population
 from jast.simulators import limit_state, walk1d
@@ -568,8 +568,8 @@ def test_a_black_box_keeps_the_thrifty_way(key, monkeypatch):
 def small(monkeypatch):
     """Populations in `jast.stress` from 50,000 evaluations on, with little to polish."""
     monkeypatch.setattr(budgets, "MIN_POPULATION_BUDGET", 50_000)
-    monkeypatch.setattr(stress, "MIN_POPULATION_BUDGET", 50_000)
-    monkeypatch.setattr(stress, "REFINE_EVALUATIONS", 6000)
+    monkeypatch.setattr(stress_test, "MIN_POPULATION_BUDGET", 50_000)
+    monkeypatch.setattr(stress_test, "REFINE_EVALUATIONS", 6000)
 
 
 @pytest.mark.slow
@@ -625,10 +625,10 @@ def test_an_interrupted_second_stress_keeps_the_first_answer(key, small, monkeyp
             raise KeyboardInterrupt
         return by_populations(name, key, sim, budget, **how)
 
-    by_populations = stress.by_populations
+    by_populations = stress_test.by_populations
     monkeypatch.setattr(budgets, "measure_budget", lambda *args: 50_000)
     monkeypatch.setattr(budgets, "next_budget", lambda found, budget: 2 * budget)
-    monkeypatch.setattr(stress, "by_populations", once)
+    monkeypatch.setattr(stress_test, "by_populations", once)
     report = jast.stress(key, limit_state(lambda u: 1.0 - u[0], 2))
     assert len(called) == 2 and report.probability.mean > 0
     assert [t.name for t in report.tried] == ["nominal", "populations"]
