@@ -35,6 +35,7 @@ PLAIN, DRAWN_ANEW, UNIT_OFF, OTHER, WIDE, UNDISTURBED = range(6)
 of the last place at every step, with all disturbances drawn anew, and with these wider than the
 model's. Then the undisturbed episode, from a start of its own."""
 PATHS = 5  # of a start
+NEVER = np.iinfo(np.int32).max  # a step that none is
 WIDTH = 3.0  # of the wide path's draws, in those of the model: rare ends are met then, too
 JUMP = 3.0  # a change of so many times the greatest before is a jump
 NEAR_START = 0.2  # of the farthest that a state has been: where a jump back ends, at most
@@ -292,6 +293,7 @@ def _resolution(c: _Company, starts: Any) -> Resolution:
         jnp.all(u) & (a.dtype != jnp.uint32 or jnp.all(a == a[:1]))
         for u, a in zip(c.unmoved, jax.tree.leaves(starts), strict=True)
     ]
+    first_jump = jnp.min(jnp.where(c.jump > 0, c.jump, NEVER))
     return Resolution(
         units=[jnp.nanmedian(jnp.where(u > 0, u, jnp.nan), axis=0) for u in c.units],
         # a whole unit has the deviation of 12 ** 0.5 roundings
@@ -300,7 +302,7 @@ def _resolution(c: _Company, starts: Any) -> Resolution:
         unmoved=unmoved,
         differ=jnp.any(c.differ),
         distance_differs=jnp.any(c.distance[:, OTHER] != c.distance[:, PLAIN]),
-        jump=jnp.min(jnp.where(c.jump > 0, c.jump, STEPS + 1)) % (STEPS + 1),
+        jump=jnp.where(first_jump < NEVER, first_jump, 0),
     )
 
 
