@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from jax.tree_util import Partial
 from reports import estimate
+from scipy.stats import beta, expon, gamma, lognorm, norm, t
 from systems import above
 
 import jast
@@ -224,19 +225,44 @@ def test_a_flagged_row_shows_what_plain_draws_guarantee_and_the_doubtful_number_
 
 
 def test_the_crossing_of_a_straight_line_and_its_interval():
-    """log p falls by log 10 a unit: the crossing of .01 lies at 1, and that of the intervals where
-    theirs does.
+    """Of two rows of .1 and .001: .01 is crossed where a straight normal score is that of .01, and
+    the interval goes to where the rows' own do by the logs on one side, by the scores on the other.
     """
-    n = 10**6
+    n, level = 10**6, 0.01
     table = table_of([2.0, 0.0], [1000, 100_000], n)
-    found = table.crossing(0.01)
-    assert found.name == "gain" and found.level == 0.01
-    assert found.value == pytest.approx(1.0, abs=1e-12)
-    ends = [[math.log(v) for v in clopper_pearson(k, n)] for k in (100_000, 1000)]
-    for i, side in ((0, 0), (1, 1)):
-        a, b = ends[0][side], ends[1][side]
-        assert found.interval[i] == pytest.approx(2 * (a - math.log(0.01)) / (a - b), abs=1e-9)
-    assert "gain 1 [0.9" in str(found)
+    found = table.crossing(level)
+    assert found.name == "gain" and found.level == level
+    score = norm.ppf([0.1, 0.001]) - norm.ppf(level)
+    assert found.value == pytest.approx(2 * score[0] / (score[0] - score[1]), abs=1e-12)
+    ends = np.array([clopper_pearson(k, n) for k in (100_000, 1000)])
+    for i, scale in enumerate((np.log, norm.ppf)):
+        a, b = scale(ends[:, i]) - scale(level)
+        assert found.interval[i] == pytest.approx(2 * a / (a - b), abs=1e-9)
+    assert "gain 1.15" in str(found) and "[0.9" in str(found)
+
+
+@pytest.mark.parametrize("rows", [4, 7, 13])
+@pytest.mark.parametrize("tail", [norm(), gamma(5), expon(), beta(2, 8), t(4), lognorm(0.5)])
+def test_the_interval_of_a_crossing_holds_the_bend_of_the_curve_between_rows(tail, rows):
+    """Rows that hardly err, from a probability of .3 to one of 1e-6, of tails that bend in either
+    way: wherever the level lies between the first and the last gap.
+    """
+    x, n = np.linspace(*tail.isf([0.3, 1e-6]), rows), 10**9
+    table = table_of(x, np.rint(n * tail.sf(x)).astype(int), n)
+    for truth in np.linspace(x[1], x[-2], 12):
+        found = table.crossing(float(tail.sf(truth)))
+        assert found.interval[0] <= truth <= found.interval[1]
+        assert found.interval[0] < found.value < found.interval[1]
+
+
+def test_of_a_normal_system_the_crossing_is_exact_between_any_rows():
+    """Within what rounding to whole failures of 10^12 episodes leaves."""
+    x, n = np.array([2.0, 3.0, 4.0]), 10**12
+    table = table_of(x, np.rint(n * norm.sf(x)).astype(int), n)
+    assert table.crossing(float(norm.sf(3.5))).value == pytest.approx(3.5, abs=1e-6)
+    assert table.crossing(float(norm.sf(2.5))).value == pytest.approx(2.5, abs=1e-6)
+    at = table.crossing(table.probability[1])  # the level of a row
+    assert at.value == pytest.approx(3.0) and np.ptp(at.interval) < 0.01
 
 
 def test_a_crossing_is_covered_as_often_as_the_rows_are():
@@ -262,7 +288,7 @@ def test_where_there_is_no_crossing_the_error_says_why():
     with pytest.raises(ValueError, match="two rows with a reliable probability, received 1 of 2"):
         table_of([0.0, 1.0], [100, 0]).crossing(0.05)
     many = table_of([0.0, 1.0, 2.0, 3.0], [900, 10, 900, 10])
-    with pytest.raises(ValueError, match="crosses 0.1 at several values of gain: 0.4"):
+    with pytest.raises(ValueError, match="crosses 0.1 at several values of gain: 0.71"):
         many.crossing(0.1)
     # within the noise of the rows it is one crossing
     one = table_of([0.0, 1.0, 2.0, 3.0], [200, 101, 99, 20]).crossing(0.1)

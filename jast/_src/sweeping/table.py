@@ -51,10 +51,10 @@ class Crossing(NamedTuple):
     name: str
     """Of the setting."""
     value: float
-    """By interpolation of log probabilities."""
+    """By interpolation of the normal scores of probabilities."""
     interval: tuple[float, float]
-    """Where the intervals of the rows, interpolated likewise, hold ``level``; infinite where they
-    still do at the last value of the sweep
+    """Where the intervals of the rows, interpolated in several ways, hold ``level``
+    (`Sweep.crossing`); infinite where they still do at the last value of the sweep
     """
     level: float
 
@@ -138,7 +138,8 @@ class Sweep(NamedTuple):
         self, level: float = 1e-6, against: str | None = None, unreliable: bool = False
     ) -> Crossing:
         """Where the probability of failure crosses ``level``, as a setting varies: between two
-        rows, log p is a straight line.
+        rows, the normal score of p is a straight line, as it is where what is compared with the
+        setting is normal.
 
         Args:
             level: probability, above 0 and below 1.
@@ -146,7 +147,9 @@ class Sweep(NamedTuple):
             unreliable: whether rows that are UNRELIABLE serve as well.
 
         Returns:
-            `Crossing`, with the interval in which the rows' own intervals hold ``level``.
+            `Crossing`. Its interval has all places where the rows' own intervals hold ``level`` by
+            straight lines of the score or of log p, and those where the lines of the neighbouring
+            rows meet it, drawn on: a curve that bends one way lies between.
 
         Raises:
             ValueError: where the rows do not cross it, or cross it in several places which their
@@ -162,23 +165,22 @@ class Sweep(NamedTuple):
                 "crossing: expected at least two rows with a reliable probability, received"
                 f" {len(rows)} of {len(x)}; unreliable=True also uses the others"
             )
-        with np.errstate(divide="ignore"):
-            x, *logs = x[rows], *(np.log(a[rows]) - math.log(level) for a in (p, low, high))
-        at = _zeros(x, logs[0])
+        x, bands = x[rows], [a[rows] for a in (p, low, high)]
+        (at, left, right), (_, *wider) = (_zone(x, bands, level, f) for f in (_score, np.log))
+        left, right = min(left, wider[0]), max(right, wider[1])
         if not at:
             raise ValueError(
                 f"crossing: the probability does not cross {level:g}: for {name} from {x[0]:.6g}"
                 f" to {x[-1]:.6g} it lies between {p[rows].min():.3g} and {p[rows].max():.3g}"
             )
-        ends = [*_zeros(x, logs[1]), *_zeros(x, logs[2])]
-        left = max((e for e in ends if e <= at[0]), default=-math.inf)
-        right = min((e for e in ends if e >= at[0]), default=math.inf)
         if at[-1] > right:
             places = ", ".join(f"{v:.6g}" for v in at)
             raise ValueError(
                 f"crossing: the probability crosses {level:g} at several values of {name}: {places}"
             )
-        return Crossing(name, (at[0] + at[-1]) / 2, (left, right), level)
+        bends = _bends(x, _score(bands[0]) - _score(level))
+        interval = min([left, *bends]), max([right, *bends])
+        return Crossing(name, (at[0] + at[-1]) / 2, interval, level)
 
     def to_dataframe(self) -> Any:
         """The table as one of pandas (the extra ``tables``), a row for each system: the settings,
@@ -309,6 +311,39 @@ def _first_warning(result):
     """The first reason not to believe a result."""
     reasons = getattr(_estimate_of(result), "warnings", ())
     return shorten(": ".join(["UNRELIABLE", *reasons[:1]]), CELL, placeholder=" ...")
+
+
+def _score(p):
+    """The normal score of p, rising; of 1 as of the greatest float below it, to be finite."""
+    from scipy.special import ndtri  # here: slow to import
+
+    return ndtri(np.minimum(p, 1 - 2.0**-53))
+
+
+def _zone(x, bands, level, scale):
+    """(where p crosses ``level``, and the nearest places on both sides where an end of its interval
+    does), by straight lines of ``scale(p)``; ``bands``: p and the ends of its intervals.
+    """
+    with np.errstate(divide="ignore"):
+        at, *ends = (_zeros(x, scale(a) - scale(level)) for a in bands)
+    ends = [*ends[0], *ends[1]]
+    left = max((e for e in ends if at and e <= at[0]), default=-math.inf)
+    return at, left, min((e for e in ends if at and e >= at[0]), default=math.inf)
+
+
+def _bends(x, y):
+    """Where the line through (x, y) is 0 if it goes on between two points, one above 0 and one
+    below, as it came to either of them; at the other one where it does not come to 0 before.
+    """
+    out = []
+    for i in np.flatnonzero((y[1:] < 0) != (y[:-1] < 0)):
+        for before, near, far in ((i - 1, i, i + 1), (i + 2, i + 1, i)):
+            if 0 <= before < len(x) and x[before] != x[near]:
+                gap = x[far] - x[near]
+                rise = (y[near] - y[before]) / (x[near] - x[before]) * gap
+                share = min(-y[near] / rise, 1) if y[near] * rise < 0 else y[near] != 0
+                out.append(float(x[near] + share * gap))
+    return out
 
 
 def _zeros(x, y):
