@@ -218,6 +218,18 @@ def test_a_system_that_ends_early_has_a_shorter_trace():
         goes_on(jast.replay(sim, x))
 
 
+def test_the_parts_of_an_episode_that_ended_before_a_window_began():
+    """It ends at 2 s, so nothing of what is inside of a window from 4 s on was asked."""
+    sim = gusts(is_terminal=lambda s: s > 3)
+    late, never = always(high(-5.0), 4, 6), eventually(high(-5.0), 4, 6)
+    for formula, most in [(late, np.inf), (never, -np.inf), (high(1.0) & late, -1.0)]:
+        e = jast.replay(under(sim, formula), jnp.array([-2.0, 4.0, 0, 0, 0, 0, 0, 0]))
+        found = parts(formula, trace_of(e), 1.0, goes_on=goes_on(e))
+        assert found.rows[0].value == e.states.robustness[int(e.length)] == most
+        assert found.rows[0].held == (not e.failure)
+        assert math.isnan(found.rows[-1].time) and str(found).splitlines()[-1].endswith("-")
+
+
 def test_numbers_that_are_none_make_an_episode_invalid():
     root = predicate(lambda s: jnp.sqrt(s + 1), "root")
     for formula in (always(root), eventually(root)):

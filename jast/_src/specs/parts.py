@@ -70,7 +70,8 @@ class Parts(NamedTuple):
                 str(p.formula), room, initial_indent=margin, subsequent_indent=margin + "    "
             )
             when = "-" if np.isnan(p.time) else f"{p.time:g}"
-            said = ("holds" if p.held else "does not") + (", decides" if p.decides else "")
+            said = "-" if np.isnan(p.value) else "holds" if p.held else "does not"
+            said += ", decides" if p.decides else ""
             lines += [f"{first:<{width}}  {when:>8}  {p.value:11.5g}  {said}", *rest]
         return "\n".join(lines)
 
@@ -79,7 +80,9 @@ def parts(formula: Formula, trace: Any, dt: float, *, goes_on: bool = False) -> 
     """Which part of a formula broke, and when; or, where it holds, what came nearest.
 
     The formula is asked at 0 s. What is inside of a window is asked at the moment of it that
-    decides: the worst for ``always``, the best for ``eventually`` and ``until``.
+    decides: the worst for ``always``, the best for ``eventually`` and ``until``. As `under`
+    does, it takes a trace that ended before a window began: ``always`` holds there, ``eventually``
+    does not, and what is inside has no moment.
 
     Args:
         formula: `Formula`.
@@ -92,7 +95,7 @@ def parts(formula: Formula, trace: Any, dt: float, *, goes_on: bool = False) -> 
         `Parts`: a row for each sub-formula, with its trace of robustness. On the host.
 
     Raises:
-        ValueError: as `robustness`.
+        ValueError: as `robustness`, but for a trace that is shorter than a window.
 
     Example:
         >>> import jax.numpy as jnp
@@ -103,7 +106,7 @@ def parts(formula: Formula, trace: Any, dt: float, *, goes_on: bool = False) -> 
         True
     """
     dt = spacing("parts", dt)
-    robustness(formula, trace, dt, goes_on=goes_on)  # its checks
+    robustness(formula, trace, dt, goes_on=True)  # its checks, but for those of windows
     given = margins("parts", formula, trace)
     found = jax.device_get(values(formula, given, dt, goes_on))
     total, rows = found.own[0], []
