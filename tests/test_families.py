@@ -287,6 +287,22 @@ def test_counts_beyond_what_floats_can_tell_apart():
     np.testing.assert_allclose(k, 1e9 + 1e9**0.5 * np.asarray([-2, 0, 3]), atol=2000)
 
 
+def test_few_degrees_of_freedom_go_on_where_the_square_is_no_float():
+    """SciPy's, to some hundred units of rounding of float32, where values are 1e23 to 1e32; with
+    degrees of freedom that are traced, so that no table serves.
+    """
+    truth, z = st.t(0.7), np.array([-10.0, 8.5, 9.0, 10.0])
+    t = np.sign(z) * truth.isf(st.norm.sf(np.abs(z)))
+    df, of_z, of_t = jnp.float32(0.7), jnp.float32(z), jnp.float32(t)
+    there = jax.jit(lambda df, z: D.from_normal(D.StudentT(df), z))(df, of_z)
+    np.testing.assert_allclose(there, t, rtol=1e-4)
+    np.testing.assert_allclose(D.StudentT(df).log_prob(of_t), truth.logpdf(t), rtol=1e-6)
+    back, slope = jax.vmap(jax.value_and_grad(lambda x: D.to_normal(D.StudentT(df), x)))(of_t)
+    np.testing.assert_allclose(back, z, rtol=1e-6)
+    expected = np.exp(truth.logpdf(t) - st.norm.logpdf(z))
+    np.testing.assert_allclose(slope / expected, 1, rtol=1e-4)
+
+
 @pytest.mark.parametrize("kind", [D.Gamma, D.Weibull])
 def test_a_shape_of_one_is_the_exponential(kind, dtype):
     """At 0, too, where the log of the number is infinite; slopes as well."""

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.custom_derivatives import SymbolicZero
 from jax.lax import lgamma, stop_gradient
-from jax.scipy.special import betainc, erfinv
+from jax.scipy.special import betainc, betaln, erfinv
 
 from jast._src.core.typing import Array, Numeric, PRNGKey
 from jast._src.distributions.base import Distribution, broadcast, float_array
@@ -136,19 +136,31 @@ class StudentT(Symmetric):
 
 def _log_t(df, t):
     norm = lgamma((df + 1) / 2) - lgamma(df / 2) - 0.5 * jnp.log(df * math.pi)
-    return norm - (df + 1) / 2 * jnp.log1p(jnp.square(t) / df)
+    return norm - (df + 1) / 2 * _log_more(df, t)
+
+
+def _log_more(df, t):
+    """log(1 + t^2 / df), also where the square is no float: with few ``df`` it matters there."""
+    s = t / jnp.sqrt(df)
+    large = jnp.abs(s) > 1
+    out = jnp.where(large, s, 1)
+    return 2 * jnp.log(jnp.abs(out)) + jnp.log1p(jnp.square(jnp.where(large, 1 / out, s)))
 
 
 def _score_t(df, t):
-    """z of |t|: near 0 by the mass between -t and t, farther out by that beyond."""
-    square = jnp.square(t)
+    """z of |t|: near 0 by the mass between -t and t, farther out by that beyond, and where that is
+    the first term of its series to rounding (DLMF 8.17.7), by the log of this.
+    """
+    square, more = jnp.square(t), _log_more(df, t)
     share = square / df
     near = square < 0.45  # where no more than half lies between, whatever df
+    far = more > -math.log(jnp.finfo(more.dtype).eps)
     half, rest = jnp.full_like(share, 0.5), df / 2
     a, b = jnp.where(near, half, rest), jnp.where(near, rest, half)
-    mass = betainc(a, b, jnp.where(near, share, 1) / (1 + share))
+    mass = betainc(a, b, jnp.where(far, 0.5, jnp.where(near, share, 1) / (1 + share)))
     inner = math.sqrt(2) * erfinv(jnp.where(near, mass, 0))
-    beyond = jnp.log(jnp.where(near, 1, mass) / 2)
+    first = -rest * more - jnp.log(rest) - betaln(rest, half)
+    beyond = jnp.where(far, first, jnp.log(jnp.where(near, 1, mass))) - math.log(2.0)
     return jnp.where(near, inner, normal_of_log_tails(jnp.zeros_like(beyond), beyond))
 
 
