@@ -52,7 +52,8 @@ def sample(d: DistributionLike, key: PRNGKey) -> ArrayTree:
 
 
 def mode(d: DistributionLike) -> ArrayTree:
-    """The likeliest value of a distribution; its median where no mode is known.
+    """The likeliest value of a distribution; its median where no mode is known. Of a `Gamma` or
+    `Beta` whose density has no maximum, or is the same everywhere, the mean.
 
     Args:
         d: a distribution.
@@ -62,8 +63,8 @@ def mode(d: DistributionLike) -> ArrayTree:
 
     Example:
         >>> from jast import distributions as D
-        >>> float(D.mode(D.tent(0.25)))
-        0.25
+        >>> float(D.mode(D.tent(0.25))), float(D.mode(D.Gamma(0.5, 1.0)))
+        (0.25, 0.5)
     """
     known = row(d, "mode").mode
     try:
