@@ -303,6 +303,25 @@ def test_few_degrees_of_freedom_go_on_where_the_square_is_no_float():
     np.testing.assert_allclose(slope / expected, 1, rtol=1e-4)
 
 
+@pytest.mark.parametrize("rate", [100.0, 205.0, 1e4, 1e5, 1e6])
+def test_large_counts_are_scipys_in_float32_too(rate):
+    """Out to |z| = 7; with a rate that is traced, so that no table serves. 1e-4: of the incomplete
+    gamma function at 100, below what is large.
+    """
+    z = np.linspace(-7, 7, 57)
+    d, of_z = st.poisson(rate), jnp.float32(z)
+    place = jax.jit(lambda rate, z: D.from_normal(D.Poisson(rate), z))
+    k = np.asarray(place(jnp.float32(rate), of_z))
+    assert k.tolist() == np.where(z < 0, d.ppf(st.norm.cdf(z)), d.isf(st.norm.sf(z))).tolist()
+    half, near = d.pmf(k) / 2, 1e-4 if rate < 200 else 3e-5
+    below, above = d.cdf(k - 1) + half, d.sf(k) + half
+    middle = np.where(below < above, st.norm.ppf(below), st.norm.isf(above))
+    np.testing.assert_allclose(D.to_normal(D.Poisson(jnp.float32(rate)), k), middle, atol=near)
+    np.testing.assert_allclose(D.Poisson(rate).log_prob(k), d.logpmf(k), atol=near)
+    slope = jax.grad(lambda rate: D.Poisson(rate).log_prob(k[40]))(jnp.float32(rate))
+    np.testing.assert_allclose(slope, k[40] / rate - 1, rtol=1e-4)
+
+
 @pytest.mark.parametrize("kind", [D.Gamma, D.Weibull])
 def test_a_shape_of_one_is_the_exponential(kind, dtype):
     """At 0, too, where the log of the number is infinite; slopes as well."""

@@ -32,8 +32,21 @@ __all__ = ["Binomial", "Geometric", "Poisson", "TiltedCounts"]
 
 MAX_EDGES = 8192
 """Numbers of a table on either side of the mean at most: 64 kB in a program."""
+LARGE = 200.0
+"""Mean from which a Poisson's tails and density are taken by its deviance in float32: they are off
+by 2e-5 there, which falls, and its incomplete gamma function by 1e-4, which rises to .1 at 1e5."""
+SERIES = tuple(2 * (-1) ** n / (n * (n - 1)) for n in range(9, 1, -1))
+"""Of `_deviance`, for polyval."""
 SPARE = 64
 """Numbers beyond so many standard deviations that a table has, as tails of few are long."""
+
+
+def _deviance(t):
+    """2 ((1 + t) log(1 + t) - t) / t^2: by its series where the difference would round."""
+    near = jnp.abs(t) < 0.1
+    far = jnp.where(near, 1, t)
+    whole = 2 * ((1 + far) * jnp.log1p(far) - far) / jnp.square(far)
+    return jnp.where(near, jnp.polyval(jnp.asarray(SERIES, t.dtype), jnp.where(near, t, 0)), whole)
 
 
 class _Counts(Elementwise):
@@ -193,13 +206,36 @@ class Poisson(_Counts):
 
         return special.pdtr(k, rate), special.pdtrc(k, rate)
 
+    @property
+    def _large(self):
+        """(whether its numbers are of its deviance, a rate for these)."""
+        large = (self.rate > LARGE) & (self.rate.dtype == jnp.float32)
+        return large, jnp.where(large, self.rate, LARGE)
+
     def _log_p(self, k):
-        return log_power(self.rate, k) - self.rate - lgamma(k + 1)
+        """Where the rate is large as Loader 2000 has it, Fast and accurate computation of binomial
+        probabilities.
+        """
+        large, rate = self._large
+        many = jnp.maximum(k, 1)
+        gap = many - rate
+        of_large = -jnp.square(gap) / (2 * rate) * _deviance(gap / rate) - 1 / (12 * many)
+        of_large -= jnp.log(2 * math.pi * many) / 2
+        exact = log_power(self.rate, k) - self.rate - lgamma(k + 1)
+        return jnp.where(large & (k > 0), of_large, exact)
 
     def log_tails(self, k: int) -> tuple[Array, Array]:
+        """Where the rate is large by the normal number of Peizer and Pratt 1968 (Journal of the
+        American Statistical Association 63, 1416-1456).
+        """
         none, up_to = k < 0, jnp.maximum(k, 0) + 1
-        below = jnp.where(none, -jnp.inf, jnp.log(gammaincc(up_to, self.rate)))
-        return below, jnp.where(none, 0.0, jnp.log(gammainc(up_to, self.rate)))
+        large, rate = self._large
+        gap = up_to - rate
+        z = (gap - 1 / 3 + 0.02 / up_to) * jnp.sqrt(_deviance((gap - 0.5) / rate) / rate)
+        below, above = log_tails(z)
+        below = jnp.where(large, below, jnp.log(gammaincc(up_to, self.rate)))
+        above = jnp.where(large, above, jnp.log(gammainc(up_to, self.rate)))
+        return jnp.where(none, -jnp.inf, below), jnp.where(none, 0.0, above)
 
     def mean(self) -> Any:
         return self.rate
@@ -210,6 +246,9 @@ class Poisson(_Counts):
 
 class Binomial(_Counts):
     """How many of ``total_count`` trials succeed, each with probability ``probs``.
+
+    In float32 with many trials its numbers are rough: with 200,000 normal numbers are off by up to
+    .15 and log densities by .3; with 2000 by a thousandth.
 
     Example:
         >>> from jast import distributions as D
