@@ -522,7 +522,14 @@ def test_the_default_selector_says_how_rough_its_expectation_is():
     inputs, labels, answers = problem(60)
     result = validate(KEY, System(answers), inputs, labels, budget=20)
     head = str(result).splitlines()[0]
-    assert f"roughly {result.expected:.0f} expected among the 40 not run (a guide only: " in head
+    assert f"roughly {result.expected:.0f} expected among the 40 not run (a guide only" in head
+    memory = result.state.memory | dict(shares=np.array([0.5, 0.0, 0.0]))
+    sure = result._replace(state=result.state._replace(memory=memory))
+    # as many draws as half of the inputs without a failure: log .05 / (exp(-1.5) - 1) / .5 in all
+    assert sure.at_most == pytest.approx(7.7125 - result.failing, abs=1e-3)
+    assert f", by its random calls at most {sure.at_most:.0f} in 95 %" in str(sure)
+    none = result.state._replace(memory={})
+    assert np.isnan(result._replace(state=none).at_most)
 
 
 GOOD = np.zeros((6, 2)), np.array([0, 1, 2, 0, 1, 2])
