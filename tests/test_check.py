@@ -631,3 +631,16 @@ def test_a_step_may_empty_its_own_state():
 def test_both_versions_leave_the_state_as_it_is():
     with pytest.raises(ValueError, match="^evaluate: changes the state"):
         jast.explain.regression(boxed(evaluate=far), boxed())
+
+
+def test_a_state_without_numbers():
+    """It is of no use, and no error."""
+    sim = jast.Simulator(
+        init=lambda x0: (),
+        step=lambda s, x: (),
+        disturbance=lambda s: D.Normal(0.0, 1.0),
+        evaluate=lambda s: (False, 1.0),
+        horizon=3,
+    )
+    with pytest.warns(UserWarning, match="no disturbance changes a number of the state"):
+        jast.check(sim)

@@ -11,7 +11,7 @@ from systems import above
 
 import jast
 from benchmarks.stress_systems import CASES, PEDESTRIANS, pedestrians
-from jast.distributions import Independent, Normal, seeds
+from jast.distributions import Fixed, Independent, Normal, seeds
 
 
 def walk(limit=4.0, **changes):
@@ -126,15 +126,25 @@ def test_a_system_that_fails_undisturbed_is_told_so(key):
     assert float(report.failures.best.reward) == 0
 
 
+@pytest.mark.slow
+def test_invalid_episodes_may_be_the_failures(key):
+    """The distance is NaN wherever it fails."""
+    sim = walk(evaluate=lambda s: (s >= 3, jnp.sqrt(3 - s)))
+    report = jast.stress(key, sim, 1000)
+    assert not len(report.failures)
+    assert f"next: mend what makes {report.invalid} episodes invalid" in str(report)
+
+
 @pytest.mark.long
-def test_a_system_whose_start_alone_is_random(key):
+@pytest.mark.parametrize("nothing", [Independent(Normal(jnp.zeros(0), 1.0), 1), Fixed()])
+def test_a_system_whose_start_alone_is_random(key, nothing):
     """It fails where the start is beyond 2: P = Phi(-2), log p relative to the mode -2."""
     sim = walk(
         2.0,
         start=lambda: Normal(0.0, 1.0),
         init=lambda x0: x0,
         step=lambda s, x: s,
-        disturbance=lambda s: Independent(Normal(jnp.zeros(0), 1.0), 1),
+        disturbance=lambda s: nothing,
     )
     report = jast.stress(key, sim, 3000)
     assert float(report.failures.best.reward) == pytest.approx(-2.0, abs=0.01)

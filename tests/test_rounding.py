@@ -40,6 +40,17 @@ def test_an_offset_is_too_coarse():
     assert "state is too coarse: a disturbance changes one" in rounding_problem(walk(4.6e6))
 
 
+def test_a_disturbance_that_is_mostly_rounded_away():
+    """Units of 1 at 1e7: of steps of deviation .3 a tenth move it, none in the median."""
+    sim = dataclasses.replace(
+        walk(1e7),
+        disturbance=lambda s: D.Normal(jnp.float32(0.0), jnp.float32(0.3)),
+        evaluate=lambda s: (s[0] >= 1e7 + 3, jnp.maximum(1e7 + 3 - s[0], 0)),
+        horizon=10,
+    )
+    assert "state is too coarse: a disturbance changes one" in rounding_problem(sim)
+
+
 def test_what_decides_nothing_may_be_coarse():
     assert rounding_problem(walk(0.0, 4.6e6)) is None
 

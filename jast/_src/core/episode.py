@@ -182,7 +182,8 @@ def replay(
     like = signature_of(sim)
     x0 = like.x0 if x0 is None and not like.random_start else x0
     x0 = conform("replay: x0", x0, like.x0)
-    rows = {jnp.shape(leaf)[0] if jnp.ndim(leaf) else -1 for leaf in jax.tree.leaves(disturbances)}
+    leaves = jax.tree.leaves(disturbances)
+    rows = {jnp.shape(leaf)[0] if jnp.ndim(leaf) else -1 for leaf in leaves} or {sim.horizon}
     if len(rows) != 1 or not 0 <= (steps := rows.pop()) <= sim.horizon:
         raise ValueError(
             f"replay: disturbances must have between 0 and {sim.horizon} rows (the horizon),"

@@ -50,7 +50,8 @@ class Resolution(NamedTuple):
 
     units: list[Array]
     """Of each float of the state: the median, over the starts, of the units in the last place by
-    which a disturbance drawn anew moves it, where it does; else NaN."""
+    which a disturbance drawn anew moves it, where it does; where it does in no start, as it is
+    mostly rounded away, by which all disturbances drawn anew do; else NaN."""
     rounding: Array
     """Standard deviation of the miss distance that rounding makes."""
     spread: Array
@@ -90,7 +91,8 @@ class _Company(NamedTuple):
     """What the paths of one start have shown; d numbers of its state."""
 
     units: list[jax.Array]
-    """The greatest way between the first two, for each float of the state."""
+    """[2, ...]: the greatest way of the second and the fourth from the first, for each float of the
+    state."""
     distance: jax.Array
     """[5]: the least so far."""
     unmoved: list[jax.Array]
@@ -186,7 +188,7 @@ def _probe(sim: Simulator) -> Probe:
         t = now.t + 1
         after, x, improbable = jax.vmap(step, (0, 0, None, 0))(own, path, now.t, now.states)
         states = jax.vmap(select)(now.done, now.states, after)
-        ends, distance, nan = jax.vmap(look)(states)
+        ends, distance, nan = jax.vmap(look, axis_size=len(own))(states)
         flags = jax.tree.map(
             lambda noted, wrong: noted.at[t].set(wrong & ~now.done, mode="drop"),
             now.flags,
@@ -208,7 +210,7 @@ def _probe(sim: Simulator) -> Probe:
     undisturbed = np.arange(starts + 1) == starts
     of_start = jax.vmap(begin)(words[:, 0], undisturbed)
     states, x0, improbable = index_tree(of_start, own)
-    ends, distance, nan = jax.vmap(look)(states)
+    ends, distance, nan = jax.vmap(look, axis_size=len(own))(states)
     flags = jax.tree.map(
         lambda wrong: jnp.zeros((noted + 1, len(own)), bool).at[0].set(wrong),
         (improbable, nan, ~jnp.isfinite(distance)),
@@ -219,7 +221,7 @@ def _probe(sim: Simulator) -> Probe:
     last = lax.while_loop(goes_on, body, now)
     density, nan, wrong = last.flags
     if sim.episodic:
-        distance = jax.vmap(sim.evaluate)(last.states)[1]
+        distance = jax.vmap(sim.evaluate, axis_size=len(own))(last.states)[1]
         wrong = wrong.at[-1].set(~jnp.isfinite(distance))
     # a black box has kept what it says of the start
     judged = last.states if sim.episodic or hosted else states
@@ -239,7 +241,7 @@ def _company(states: Any, distance: jax.Array) -> _Company:
     numbers = _numbers(states)
     no, nowhere = jnp.zeros((), bool), jnp.zeros_like(numbers)
     return _Company(
-        units=[jnp.zeros_like(a[0]) for a in _floats(states)],
+        units=[jnp.zeros_like(a[:2]) for a in _floats(states)],
         distance=jnp.full_like(distance, jnp.inf),
         unmoved=[~no for _ in jax.tree.leaves(states)],
         differ=no,
@@ -294,8 +296,9 @@ def _resolution(c: _Company, starts: Any) -> Resolution:
         for u, a in zip(c.unmoved, jax.tree.leaves(starts), strict=True)
     ]
     first_jump = jnp.min(jnp.where(c.jump > 0, c.jump, NEVER))
+    units = (jnp.nanmedian(jnp.where(u > 0, u, jnp.nan), axis=0) for u in c.units)
     return Resolution(
-        units=[jnp.nanmedian(jnp.where(u > 0, u, jnp.nan), axis=0) for u in c.units],
+        units=[jnp.where(jnp.isnan(one), all_, one) for one, all_ in units],
         # a whole unit has the deviation of 12 ** 0.5 roundings
         rounding=jnp.sqrt(jnp.mean(gap**2) / 12),
         spread=jnp.std(first),
@@ -325,11 +328,12 @@ def _floats(tree: Any) -> list[jax.Array]:
 
 
 def _units_apart(a: jax.Array) -> jax.Array:
-    """How far the second path is from the first, in units of the last place."""
-    size = jnp.abs(a[PLAIN])
-    units = jnp.abs(a[DRAWN_ANEW] - a[PLAIN]) / (
-        jnp.nextafter(size, jnp.full_like(size, jnp.inf)) - size
-    )
+    """[2, ...]: how far the second and the fourth path are from the first, in units of the last
+    place.
+    """
+    size = jnp.abs(a[PLAIN : PLAIN + 1])
+    unit = jnp.nextafter(size, jnp.full_like(size, jnp.inf)) - size
+    units = jnp.abs(a[np.array([DRAWN_ANEW, OTHER])] - a[PLAIN : PLAIN + 1]) / unit
     return jnp.where(jnp.isfinite(units), units, 0)
 
 

@@ -33,7 +33,7 @@ def traps(sim: Simulator, seen: Resolution) -> list[str]:
     its ``resolution``: a text each, which names the function at fault.
     """
     signature, (equations, level, keys) = signature_of(sim), _program(sim)
-    found = [f"step: {text}" for text in (describe(seen), _jumps(seen)) if text is not None]
+    found = [f"step: {text}" for text in (describe(sim, seen), _jumps(seen)) if text is not None]
     found += _fixed_keys(signature.state, seen, keys)
     if seen.distance_differs and level:
         found.append(

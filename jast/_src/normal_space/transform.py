@@ -377,8 +377,9 @@ def side_by_side(sim: Simulator, function: Callable, *rows: Any, lanes: int = LA
 
 def flat(sim: Simulator, z0: Any, z: Any) -> jax.Array:
     """The points [n, D] of latents like x0 [n, ...] (``()``: one start) and x [n, horizon, ...]."""
-    steps = jnp.concatenate([a.reshape(*a.shape[:2], -1) for a in jax.tree.leaves(z)], axis=2)
-    parts = [a.reshape(len(steps), -1) for a in (*jax.tree.leaves(z0), steps)]
+    steps = [a.reshape(*a.shape[:2], -1) for a in jax.tree.leaves(z)]
+    steps = [jnp.concatenate(steps, axis=2)] if steps else []  # none where only the start is random
+    parts = [a.reshape(len(a), -1) for a in (*jax.tree.leaves(z0), *steps)]
     return jnp.concatenate([a.astype(normal_numbers(sim)) for a in parts], axis=1)
 
 
