@@ -181,6 +181,21 @@ def test_random_starts_are_found():
     assert mixed.failures.episodes.disturbances["gust"].shape == (mixed.failures.size, 8, 2)
 
 
+@pytest.mark.slow
+def test_seeds_that_start_an_episode_have_no_place(key):
+    """They have no quantile function, and are drawn; the disturbances have places."""
+    sim = jast.Simulator(
+        init=lambda x0: jnp.zeros(()),
+        start=jast.distributions.seeds,
+        step=lambda s, x: s + x,
+        disturbance=lambda s: jast.distributions.Normal(0.0, 1.0),
+        evaluate=lambda s: (s > 6, jnp.maximum(6 - s, 0.0)),
+        horizon=5,
+    )
+    found = forest(key, sim, trees=2, simulations=200, prunes=2)
+    assert found.failures and bool(jast.replay(sim, found.failures[0]).failure)
+
+
 def test_mcts_is_a_forest_of_one_root(equal):
     size = dict(trees=6, simulations=60, reward=BONUS, widening=(2.0, 0.5))
     one, other = (

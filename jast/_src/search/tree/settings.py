@@ -110,7 +110,9 @@ class Choice:
         ``start``: it is an x0.
         """
         kinds = 2 if self._can_focus(dist) else 1
-        places = hasattr(self.actions, "place") and (not start or self.actions.places_start)
+        places = hasattr(self.actions, "place")
+        if places and start:  # seeds have no quantile function
+            places = self.actions.places_start and D.has_quantile(dist)
         if self.spread and places:
             x = self.actions.place(_point(key, slot // kinds, D.event_like(dist)), dist)
         else:
