@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from checks import compiled
+from jax.tree_util import Partial
 from scipy import stats
 
 import jast
@@ -622,3 +623,28 @@ def test_plain_draws_are_in_the_checkpoint(key, tmp_path, monkeypatch):
     monkeypatch.setattr(answer, "simulate_points", None)
     again = population(key, sim, 100_000, particles=N, checkpoint=tmp_path)
     assert again.failing == found.failing and again.interval == found.interval
+
+
+@pytest.mark.slow
+def test_what_is_timed_is_compiled_before(key, monkeypatch):
+    """Also of a system that has put its arrays on a device, as those of MJX have."""
+    from jast._src.estimate.population import population as timed
+
+    pull = jax.device_put(jnp.full((), 0.9), jax.devices()[0])
+    sim = jast.Simulator(
+        init=lambda x0: jnp.zeros(()),
+        step=Partial(lambda pull, s, x: pull * s + x, pull),
+        disturbance=lambda s: D.Normal(0.0, 1.0),
+        evaluate=lambda s: (s > 5, jnp.maximum(5 - s, 0.0)),
+        horizon=7,
+    )
+    read_clock, counts = timed.read_clock, []
+
+    def read():
+        counts.append(len(heard))
+        return read_clock()
+
+    monkeypatch.setattr(timed, "read_clock", read)
+    with compiled() as heard:
+        assert timed.episodes_a_second(key, sim) > 0
+    assert len(set(counts)) == 1 and counts[0] >= 2

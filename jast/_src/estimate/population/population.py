@@ -146,11 +146,13 @@ def population(
 
 def episodes_a_second(key: jax.Array, sim: Simulator) -> float:
     """How many episodes a population simulates in a CPU second (of an accelerator: a second), by
-    two timed draws after one that compiles.
+    two timed draws after two that compile.
     """
     n = population_size(sim)
     particles, key = allocate_particles(sim, n), counter_key(key, 4)
-    particles, _ = draw_particles(sim, particles, key, MIN_PARTICLES)
+    for _ in range(2):  # arrays that the system has put on a device take the points there, too
+        particles, _ = draw_particles(sim, particles, key, MIN_PARTICLES)
+    jax.block_until_ready(particles)
     m = MIN_PARTICLES if on_cpu() else n  # an accelerator takes as long for few
     while True:  # an expensive system is not run so often for this
         begun = read_clock()
