@@ -451,3 +451,12 @@ def test_whole_numbers_are_settings_of_a_tent_and_seeds_of_a_choice():
     assert 0 <= D.tent(0, 0.5).sample(seed=3) < 0.5
     d = D.where(True, D.Normal(0.0, 1.0), D.Normal(1.0, 1.0))
     assert d.sample(seed=3) == D.Normal(0.0, 1.0).sample(seed=3)
+
+
+@pytest.mark.parametrize("count", [0.0, 1.0, 2.0])
+def test_next_to_no_counts_of_a_large_mean(count):
+    """1e8 less what a count of one or two adds; (1 + t) log(1 + t) is 0 where t rounds to -1."""
+    d = D.Poisson(1e8)
+    low, high = d.log_tails(jnp.float32(count))
+    assert float(d.log_prob(jnp.float32(count))) == pytest.approx(-1e8, rel=1e-5)
+    assert float(low) < -1e7 and float(high) == pytest.approx(0, abs=1e-6)

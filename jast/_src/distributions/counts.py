@@ -43,6 +43,7 @@ SPARE = 64
 
 def _deviance(t):
     """2 ((1 + t) log(1 + t) - t) / t^2: by its series where the difference would round."""
+    t = jnp.maximum(t, jnp.finfo(t.dtype).epsneg - 1)  # of a count that is next to none
     near = jnp.abs(t) < 0.1
     far = jnp.where(near, 1, t)
     whole = 2 * ((1 + far) * jnp.log1p(far) - far) / jnp.square(far)
