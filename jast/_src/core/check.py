@@ -21,11 +21,7 @@ from jast import distributions as D
 from jast._src.core.actions import Quantiles, Samples, UniformBox, Wide
 from jast._src.core.lost_failures import warn_of_lost_failures
 from jast._src.core.probe import probe
-from jast._src.core.simulator import (
-    Simulator,
-    first_state,
-    require_simulator,
-)
+from jast._src.core.simulator import Simulator, first_state, require_simulator
 from jast._src.core.traps import traps
 from jast._src.core.typing import Actions
 from jast._src.runtime._jax import is_traced, is_tracing, quick

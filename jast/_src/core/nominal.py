@@ -159,8 +159,7 @@ def nominal(
     contract("nominal", sim)
     placement = work.placement("nominal", executor, devices)
     before = incidents(sim)
-    signature = signature_of(sim)
-    calm = signature.start.mode and signature.disturbance.mode
+    calm = signature_of(sim).has_mode
     quiet = rollout(key, sim, undisturbed(sim)) if calm else None  # draws nothing
     with (
         open_checkpoint("nominal", checkpoint, key, sim=sim, episodes=asked) as store,

@@ -97,8 +97,6 @@ class _Company(NamedTuple):
     """[5]: the least so far."""
     unmoved: list[jax.Array]
     differ: jax.Array
-    start: jax.Array
-    """[d]."""
     numbers: jax.Array
     """[d]: of the wide path now."""
     farthest: jax.Array
@@ -129,7 +127,6 @@ def probe(sim: Simulator) -> Probe:
 @quick
 def _probe(sim: Simulator) -> Probe:
     signature, hosted = signature_of(sim), runs_on_host(sim)
-    has_mode = signature.start.mode and signature.disturbance.mode
     widens = signature.disturbance.closed and not hosted  # where that costs no more
     starts, paths = (HOSTED_STARTS, 1) if hosted else (STARTS, PATHS)
     steps = sim.horizon if sim.episodic else min(sim.horizon, STEPS)
@@ -146,7 +143,7 @@ def _probe(sim: Simulator) -> Probe:
 
     def calm(undisturbed, dist, x):
         """``x``, or the mode of an undisturbed episode."""
-        if not has_mode:
+        if not signature.has_mode:
             return x
         mode = jax.tree.map(lambda mode, x: jnp.asarray(mode, x.dtype), D.mode(dist), x)
         return select(undisturbed, mode, x)
@@ -197,7 +194,7 @@ def _probe(sim: Simulator) -> Probe:
         company = now.company
         if company is not None:
             seen = of_starts((states, x, distance))
-            later = jax.vmap(_follow, (0, 0, 0, 0, None))(company, *seen, t)
+            later = jax.vmap(_follow, (0, 0, 0, 0, 0, None))(company, origins, *seen, t)
             company = jax.vmap(select)(over(now.done), company, later)
         first_x = select(now.t == 0, x, now.x)
         return _Now(t, states, now.done | ends, flags=flags, x=first_x, company=company)
@@ -216,6 +213,7 @@ def _probe(sim: Simulator) -> Probe:
         (improbable, nan, ~jnp.isfinite(distance)),
     )
     company = None if hosted else jax.vmap(_company)(*of_starts((states, distance)))
+    origins = None if hosted else company.numbers
     x = jax.tree.map(lambda s: jnp.zeros((len(own), *s.shape), s.dtype), signature.x)
     now = _Now(jnp.int32(0), states, ends, flags=flags, x=x, company=company)
     last = lax.while_loop(goes_on, body, now)
@@ -227,7 +225,7 @@ def _probe(sim: Simulator) -> Probe:
     judged = last.states if sim.episodic or hosted else states
     noted = np.flatnonzero(np.isin(path, (PLAIN, OTHER, UNDISTURBED)))
     flags = jax.tree.map(lambda a: a[:, noted].T, (density, nan, wrong))
-    found = Probe(has_mode, *flags, *index_tree((x0, last.x, judged), 0), resolution=None)
+    found = Probe(signature.has_mode, *flags, *index_tree((x0, last.x, judged), 0), resolution=None)
     if hosted:
         return found
     company = last.company
@@ -245,7 +243,6 @@ def _company(states: Any, distance: jax.Array) -> _Company:
         distance=jnp.full_like(distance, jnp.inf),
         unmoved=[~no for _ in jax.tree.leaves(states)],
         differ=no,
-        start=numbers,
         numbers=numbers,
         farthest=nowhere,
         change=nowhere,
@@ -253,14 +250,18 @@ def _company(states: Any, distance: jax.Array) -> _Company:
     )
 
 
-def _follow(company: _Company, states: Any, x: Any, distance: jax.Array, t: jax.Array) -> _Company:
-    """One step on: ``states`` [5, ...] are those after step ``t``, ``x`` [5, ...] led there."""
+def _follow(
+    company: _Company, origin: jax.Array, states: Any, x: Any, distance: jax.Array, t: jax.Array
+) -> _Company:
+    """One step on: ``states`` [5, ...] are those after step ``t``, ``x`` [5, ...] led there from
+    the start, whose numbers are ``origin`` [d].
+    """
     moves = company.farthest > 0
     count = jnp.sum(moves, dtype=jnp.int32)
     scale = jnp.where(moves, company.farthest, 1)
 
     def norm(a):
-        return jnp.sqrt(jnp.sum(jnp.where(moves, (a - company.start) / scale, 0) ** 2))
+        return jnp.sqrt(jnp.sum(jnp.where(moves, (a - origin) / scale, 0) ** 2))
 
     numbers, before = _numbers(states), norm(company.numbers)
     change = jnp.abs(numbers - company.numbers)
@@ -277,9 +278,8 @@ def _follow(company: _Company, states: Any, x: Any, distance: jax.Array, t: jax.
         distance=jnp.minimum(company.distance, distance),
         unmoved=[u & jnp.all(a[OTHER] == a[PLAIN]) for u, a in leaves],
         differ=company.differ | jnp.any(jnp.stack(differ or [False])),
-        start=company.start,
         numbers=numbers,
-        farthest=jnp.maximum(company.farthest, jnp.abs(numbers - company.start)),
+        farthest=jnp.maximum(company.farthest, jnp.abs(numbers - origin)),
         change=jnp.maximum(company.change, change),
         jump=jnp.where(jumped & (company.jump == 0), t, company.jump),
     )

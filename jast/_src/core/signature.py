@@ -83,11 +83,16 @@ class Signature:
         return self.start.closed and self.disturbance.closed
 
     @property
+    def has_mode(self) -> bool:
+        """Whether x0 and x have modes (or medians): there is an undisturbed episode."""
+        return self.start.mode and self.disturbance.mode
+
+    @property
     def density(self) -> str:
         """What log p counts in, free of units where it can be: "mode" (less its value at the mode)
         where x0 and x have modes, else "raw".
         """
-        return "mode" if self.start.mode and self.disturbance.mode else "raw"
+        return "mode" if self.has_mode else "raw"
 
 
 def signature_of(sim: Simulator) -> Signature:

@@ -30,7 +30,7 @@ CALLS = {"jit", "pjit", "closed_call", "custom_jvp_call", "custom_vjp_call", "re
 
 def traps(sim: Simulator, seen: Resolution) -> list[str]:
     """What loses failures, or minutes, of a simulator that keeps its contract, not on the host, by
-    its ``resolution``: a text each, which names the function at fault.
+    what a probe has ``seen``: a text each, which names the function at fault.
     """
     signature, (equations, level, keys) = signature_of(sim), _program(sim)
     found = [f"step: {text}" for text in (describe(sim, seen), _jumps(seen)) if text is not None]

@@ -193,8 +193,7 @@ def _quiet(sim):
         after = next_state(sim, state, likely(sim.disturbance(state)))
         return select(sim.is_terminal(state), state, after)
 
-    signature = signature_of(sim)
-    calm = signature.start.mode and signature.disturbance.mode
+    calm = signature_of(sim).has_mode
     state = first_state(sim, likely(sim.start()))
     steps = sim.horizon if sim.episodic else 0
     distance = sim.evaluate(jax.lax.fori_loop(0, steps, move, state))[1]

@@ -214,8 +214,7 @@ def undisturbed_series(sim: Simulator) -> Series | None:
     """The `Series` of the undisturbed episode; None where a disturbance has neither a mode nor a
     median.
     """
-    signature = signature_of(sim)
-    if not (signature.start.mode and signature.disturbance.mode):
+    if not signature_of(sim).has_mode:
         return None
     quiet = rollout(jax.random.key(0), sim, undisturbed(sim))
     return series_of(sim, index_tree(quiet, None))

@@ -224,13 +224,13 @@ def advice(r: Any) -> str:
     """What a user would do next."""
     if r.nominal.undisturbed is not None and bool(r.nominal.undisturbed.failure):
         return "next: repair the system, which fails without any disturbance"
-    if not len(r.failures) and r.invalid:
+    if not len(r.failures):
+        if not r.invalid:
+            return "next: a larger budget; a miss distance that falls on the way to a failure"
         return (
             f"next: mend what makes {r.invalid:,} episodes invalid, which may be the failures: a"
             " number of them is not finite"
         )
-    if not len(r.failures):
-        return "next: a larger budget; a miss distance that falls on the way to a failure"
     words = ["next: jast.replay(sim, report.failures[0]) for its states"]
     if r.probability is not None and not r.probability.reliable:
         words.append("a larger budget, or jast.estimate.subset_simulation, for the probability")

@@ -166,19 +166,20 @@ class Sweep(NamedTuple):
                 f" {len(rows)} of {len(x)}; unreliable=True also uses the others"
             )
         x, bands = x[rows], [a[rows] for a in (p, low, high)]
-        (at, left, right), (_, *wider) = (_zone(x, bands, level, f) for f in (_score, np.log))
-        left, right = min(left, wider[0]), max(right, wider[1])
-        if not at:
+        scores = _score(bands[0]) - _score(level)
+        if not (at := _zeros(x, scores)):
             raise ValueError(
                 f"crossing: the probability does not cross {level:g}: for {name} from {x[0]:.6g}"
                 f" to {x[-1]:.6g} it lies between {p[rows].min():.3g} and {p[rows].max():.3g}"
             )
+        (left, right), wider = (_zone(x, bands, level, f) for f in (_score, np.log))
+        left, right = min(left, wider[0]), max(right, wider[1])
         if at[-1] > right:
             places = ", ".join(f"{v:.6g}" for v in at)
             raise ValueError(
                 f"crossing: the probability crosses {level:g} at several values of {name}: {places}"
             )
-        bends = _bends(x, _score(bands[0]) - _score(level))
+        bends = _bends(x, scores)
         interval = min([left, *bends]), max([right, *bends])
         return Crossing(name, (at[0] + at[-1]) / 2, interval, level)
 
@@ -321,14 +322,14 @@ def _score(p):
 
 
 def _zone(x, bands, level, scale):
-    """(where p crosses ``level``, and the nearest places on both sides where an end of its interval
-    does), by straight lines of ``scale(p)``; ``bands``: p and the ends of its intervals.
+    """The nearest places on both sides of where p crosses ``level``, at which an end of its
+    interval does, by straight lines of ``scale(p)``; ``bands``: p and the ends of its intervals.
     """
     with np.errstate(divide="ignore"):
         at, *ends = (_zeros(x, scale(a) - scale(level)) for a in bands)
     ends = [*ends[0], *ends[1]]
-    left = max((e for e in ends if at and e <= at[0]), default=-math.inf)
-    return at, left, min((e for e in ends if at and e >= at[0]), default=math.inf)
+    left = max((e for e in ends if e <= at[0]), default=-math.inf)
+    return left, min((e for e in ends if e >= at[0]), default=math.inf)
 
 
 def _bends(x, y):

@@ -232,7 +232,7 @@ class TiltFamily(NamedTuple):
             v = np.exp(power * (own - own.max()))
             one = fit_tilt(rows, v, effective_sample_size(power * own), model)
             one = one._replace(kept=self.kept)
-            tilts += [one, scale_tilt(one, s.defensive_scale)._replace(kept=self.kept)]
+            tilts += [one, scale_tilt(one, s.defensive_scale)]
             weights += [mass * (1 - s.model_share - wide), mass * wide]
         return Mixture(tilts, weights, frame)
 

@@ -374,7 +374,8 @@ def model_tilt(about: Shape, components_each: int) -> Tilt:
 
 def scale_tilt(tilt: Tilt, by: float) -> Tilt:
     """A tilt that moves ``by`` of the way."""
-    return Tilt(*(Block(by * b.means, b.gates, by * b.shifts, 0 * b.scales) for b in tilt[:2]))
+    blocks = (Block(by * b.means, b.gates, by * b.shifts, 0 * b.scales) for b in tilt[:2])
+    return Tilt(*blocks, kept=tilt.kept)
 
 
 def of_tilts(q: Tilts) -> tuple[list[Tilt], np.ndarray, Frame]:
