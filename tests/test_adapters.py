@@ -209,6 +209,16 @@ def test_other_numbers_compile_nothing(key):
 ENV = Drift()
 
 
+def test_arrays_that_were_put_on_the_device_compile_nothing(key):
+    put = jax.device_put(jnp.array([2.0])[0], jax.devices()[0])  # as mjx.put_model does
+    assert put.committed
+    sim = body(put, force=Normal(jnp.zeros(1), 1.0))
+    monte_carlo(key, body(force=Normal(jnp.zeros(1), 1.0)), 100)
+    with compiled() as programs:
+        monte_carlo(key, sim, 100)
+    assert not programs
+
+
 def test_what_breaks_is_invalid(key):
     """A NaN in the state, one step in two."""
     flip = (
@@ -483,10 +493,17 @@ def moved(mass, data):
     )
 
 
-def body(**settings):
-    settings = dict(horizon=6, distance=lambda now: 0.5 - now.state.qpos[0], step=moved) | settings
-    held = lambda seen: -3.0 * seen[:1] - 2.0 * seen[1:]
-    return mjx(jnp.array(2.0), Data(), held, **settings)
+def held(seen):
+    return -3.0 * seen[:1] - 2.0 * seen[1:]
+
+
+def short_of_half(now):
+    return 0.5 - now.state.qpos[0]
+
+
+def body(mass=2.0, **settings):
+    settings = dict(horizon=6, distance=short_of_half, step=moved) | settings
+    return mjx(jnp.asarray(mass, float), Data(), held, **settings)
 
 
 @pytest.mark.slow

@@ -10,7 +10,7 @@ import numpy as np
 
 from jast._src.util.pytrees import Key
 
-__all__ = ["as_numbers", "in_dtypes_of", "refuse_warp", "with_keys"]
+__all__ = ["as_numbers", "free_to_move", "in_dtypes_of", "refuse_warp", "with_keys"]
 
 
 def as_numbers(tree: Any) -> Any:
@@ -43,6 +43,22 @@ def in_dtypes_of(tree: Any, like: Any) -> Any:
         return jnp.asarray(a, b.dtype if same else None)
 
     return jax.tree.map(cast, tree, like)
+
+
+def free_to_move(tree: Any) -> Any:
+    """``tree`` with arrays that were put on the default device as if they had come there by
+    themselves. What JAX computes from an array that was put somewhere counts as put there, too, and
+    a program is compiled once for such arguments and once for others: MuJoCo puts its models.
+    """
+
+    def free(a: Any) -> Any:
+        put = isinstance(a, jax.Array) and not isinstance(a, jax.core.Tracer) and a.committed
+        typed = put and jnp.issubdtype(a.dtype, jax.dtypes.prng_key)
+        if not put or typed or a.devices() != jnp.zeros(()).devices():
+            return a
+        return jnp.asarray(np.asarray(a))
+
+    return jax.tree.map(free, tree)
 
 
 def refuse_warp(name: str, model: Any, instead: str) -> None:
