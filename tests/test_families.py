@@ -6,12 +6,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.special
 import scipy.stats as st
 from systems import mark_long
 
 import jast
 from jast import distributions as D
-from jast._src.distributions.normal_tails import log_tails, normal_of_log_tails
+from jast._src.distributions.normal_tails import log_one_less, log_tails, normal_of_log_tails
 
 Z = np.concatenate([-np.geomspace(7.1, 0.01, 60), np.geomspace(0.01, 7.1, 60)])
 
@@ -367,6 +368,13 @@ def test_counts_are_found_from_far_and_near(d, scipys, x64):
     """From a guess that is good in the middle, and far off in the tails of few."""
     k = mapped(lambda z: D.from_normal(jax.tree.map(jnp.float64, d), z), jnp.asarray(Z))
     np.testing.assert_allclose(k, truth(scipys, Z), atol=1e-9)
+
+
+def test_tails_below_the_least_float_have_their_normal_numbers(dtype):
+    log_p = np.append(-np.linspace(0.7, 708, 5001), -np.inf).astype(dtype)
+    z = normal_of_log_tails(jnp.array(log_p), log_one_less(jnp.array(log_p)))
+    theirs = scipy.special.ndtri_exp(np.maximum(log_p.astype(float), np.log(np.finfo(float).tiny)))
+    np.testing.assert_allclose(z, theirs, rtol=max(4 * np.finfo(dtype).eps, 1e-11))
 
 
 @pytest.mark.slow
