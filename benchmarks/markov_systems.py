@@ -122,6 +122,47 @@ def components_probability(fails, repaired, n, down, steps):
     return float(total)
 
 
+# a rare coin beside a run of one face of a die
+
+
+def coin_and_run(coin=1e-4, faces=20, run=4, steps=6):
+    """A coin and a die a step; failure by one coin, or by ``run`` times face 0 in turn."""
+    arrays = jnp.asarray(coin, float), jnp.zeros(faces)
+    return jast.Simulator(
+        lambda x0: (jnp.zeros((), bool), jnp.zeros((), jnp.int32)),
+        _counted,
+        Partial(_coin_and_die, *arrays),
+        Partial(_tossed_or_long, jnp.asarray(run, jnp.int32)),
+        steps,
+    )
+
+
+def _counted(s, x):
+    tossed, length = s
+    return tossed | (x["coin"] == 1), jnp.where(x["die"] == 0, length + 1, 0)
+
+
+def _coin_and_die(coin, faces, s):
+    return D.Joint({"coin": D.Bernoulli(probs=coin), "die": D.Categorical(faces)})
+
+
+def _tossed_or_long(run, s):
+    tossed, length = s
+    fails = tossed | (length >= run)
+    return fails, jnp.where(fails, 0, run - length).astype(float)
+
+
+def coin_and_run_probability(coin, faces, run, steps):
+    """By the chain of the length of the run."""
+    chain = np.zeros((run + 1, run + 1))
+    for i in range(run):
+        chain[i, run] += coin
+        chain[i, i + 1] += (1 - coin) / faces
+        chain[i, 0] += (1 - coin) * (1 - 1 / faces)
+    chain[run, run] = 1
+    return float(np.linalg.matrix_power(chain, steps)[0, run])
+
+
 # a sensor that drops out
 
 
@@ -271,6 +312,7 @@ CASES: dict[str, tuple[Callable, float]] = {
     "queue": _of(queue, queue_probability, 0.33, 20, 200),
     "components": _of(components, components_probability, 1e-3, 0.2, 5, 3, 100),
     "components 1e-6": _of(components, components_probability, 5e-4, 0.5, 5, 3, 100),
+    "coin and run": _of(coin_and_run, coin_and_run_probability, 1e-4, 20, 4, 6),
     "dropout": _of(dropout, dropout_probability, 1e-5, 8.0, 50),
     "dropout 1e-7": _of(dropout, dropout_probability, 1e-7, 8.0, 50),
     "contaminated": (
