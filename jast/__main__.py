@@ -50,7 +50,10 @@ SYSTEMS = {  # name: the simulator, the reward and the actions of a search
     ),
 }
 ITERATIONS = 10  # of the cross-entropy method, which keeps a tenth of the samples of each
-OPTIONS = [  # of one search: the option, and the methods that have it
+OPTIONS = [  # the option, and the methods that have it
+    ("budget", ("stress",)),
+    ("seconds", ("stress",)),
+    ("checkpoint", ("stress",)),
     ("prunes", ("forest",)),
     ("heads", ("forest",)),
     ("paper", ("forest", "mcts")),
@@ -74,8 +77,6 @@ def main(argv=None):
         parser.error("argument --method: a system of your own has stress, no other")
     if options.method == "stress" and a_search:
         parser.error("argument --budget: stress has a budget; the other counts are of searches")
-    if options.method != "stress" and options.budget is not None:
-        parser.error("argument --budget: only of stress; a search has --trees and --simulations")
     for name, methods in OPTIONS:
         if getattr(options, name) and options.method not in methods:
             parser.error(
@@ -145,6 +146,18 @@ def _parser():
         ("--prunes", "roots of a tree of the forest (default: 18)"),
     ]:
         add(name, type=_count, metavar="N", help=text)
+    add(
+        "--seconds",
+        type=float,
+        metavar="S",
+        help="in place of --budget: what so many CPU seconds simulate (a black box: seconds)",
+    )
+    add(
+        "--checkpoint",
+        type=Path,
+        metavar="FOLDER",
+        help="keeps what stress has done: the same command goes on where it was stopped",
+    )
     add("--seed", type=_seed, default=0, metavar="N", help="random seed (default: 0)")
     add(
         "--output",
@@ -204,8 +217,15 @@ def _load(parser, place):
     spec = importlib.util.spec_from_file_location(Path(file).stem, file)
     module = importlib.util.module_from_spec(spec)
     sys.modules[spec.name] = module
+    sys.path.insert(0, str(Path(file).resolve().parent))  # its neighbours, as Python has it
     spec.loader.exec_module(module)
-    found = getattr(module, name, None)
+    if not hasattr(module, name):
+        held = [key for key, value in vars(module).items() if isinstance(value, Simulator)]
+        parser.error(
+            f"argument FILE.py:NAME: {file} has no jast.Simulator {name}; it has"
+            f" {', '.join(held) or 'none'}"
+        )
+    found = getattr(module, name)
     if callable(found) and not isinstance(found, Simulator):
         try:
             inspect.signature(found).bind()
@@ -224,7 +244,14 @@ def _stress(options, own):
     name = options.system or options.simulator
     sim = SYSTEMS[name][0]() if own is None else own
     key = jax.random.key(options.seed)
-    report = stress(key, sim, options.budget, progress=not options.quiet)
+    report = stress(
+        key,
+        sim,
+        options.budget,
+        seconds=options.seconds,
+        checkpoint=options.checkpoint,
+        progress=not options.quiet,
+    )
     path = options.output / "report.npz"
     save(path, report)  # before anything is printed: a pipe may be closed
     print(f"{name}, seed {options.seed}\n{report}\n", flush=True)

@@ -14,6 +14,7 @@ import jast
 from jast import __main__ as cli
 
 ROOT = Path(__file__).parents[1]
+HELD = jast.simulators.walk1d()
 SMALL = ["--trees", "2", "--simulations", "30", "--quiet"]
 
 
@@ -117,6 +118,40 @@ def test_stress_of_a_system_of_ones_own(capsys, tmp_path):
         assert words in capsys.readouterr().err
 
 
+def stopped_stress(monkeypatch, tmp_path, *argv):
+    """What a command line hands to `jast.stress`: (simulator, budget, settings)."""
+    given = []
+
+    def stress(key, sim, budget, **settings):
+        given.append((sim, budget, settings))
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(cli, "stress", stress)
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    assert cli.main([*argv, "--quiet", "--output", str(tmp_path / "out")]) == 130
+    return given[0]
+
+
+def test_a_file_finds_its_neighbour_and_so_do_the_workers_of_its_black_box(monkeypatch, tmp_path):
+    (tmp_path / "neighbour_of_it.py").write_text("def limit():\n    return 2.0\n")
+    (tmp_path / "file_with_one.py").write_text(
+        "import jast\nfrom neighbour_of_it import limit\n\n"
+        "def run(x):\n    import neighbour_of_it as other\n    near = other.limit() - float(x[0])\n"
+        "    return near <= 0, max(near, 0.0)\n\n"
+        "sim = jast.blackbox.from_python(\n    run, horizon=1, workers=1,"
+        " disturbance=jast.distributions.Normal(0.0, limit()),\n)\n"
+    )
+    sim, *_ = stopped_stress(monkeypatch, tmp_path, f"{tmp_path / 'file_with_one.py'}:sim")
+    assert float(jast.replay(sim, jax.numpy.array([0.5])).distance) == 1.5
+
+
+def test_options_go_to_stress_as_they_are(monkeypatch, tmp_path):
+    options = ["--seconds", "2.5", "--checkpoint", str(tmp_path / "kept")]
+    _, budget, settings = stopped_stress(monkeypatch, tmp_path, *options)
+    assert budget is None
+    assert settings == dict(seconds=2.5, checkpoint=tmp_path / "kept", progress=False)
+
+
 @pytest.mark.long
 def test_stress_is_what_is_run_where_nothing_is_said(capsys, tmp_path):
     assert cli.main(["--budget", "20000", "--quiet", "--output", str(tmp_path / "out")]) == 0
@@ -203,6 +238,9 @@ def test_help(capsys):
         (["--simulator", "ferry", "mine.py:sim"], "argument --simulator: of the built-in ones"),
         (["sim"], "argument FILE.py:NAME: name the simulator, too, as in sim:sim"),
         ([f"{__file__}:run"], "argument FILE.py:NAME: run must need no arguments"),
+        ([f"{__file__}:rum"], f"{__file__} has no jast.Simulator rum; it has HELD"),
+        (["--method", "cem", "--seconds", "3"], "argument --seconds: only of --method stress"),
+        (["--seconds", "0"], "stress: seconds must be a number above 0, received 0.0"),
         (
             ["--method", "mcts", "--prunes", "3"],
             "argument --prunes: only of --method forest, not of mcts",
