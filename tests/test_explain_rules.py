@@ -123,6 +123,42 @@ def test_rules_of_modes_and_of_an_archive(key):
     assert str(a) == str(b)
 
 
+def test_rules_of_many_modes_tell_failures_from_others(key):
+    """Failures are balls around six points. Near misses count as much as all kinds of failures, not
+    as much as each: then there was a rule for each mode, and nothing was said not to fail.
+    """
+    centre = 4.0 * np.concatenate([np.eye(3, 4), -np.eye(3, 4)]).astype(np.float32)
+    sim = jast.simulators.limit_state(
+        lambda z: jnp.sqrt(jnp.min(jnp.sum((z[None] - centre) ** 2, axis=1)) + 1e-9) - 1.5, 4
+    )
+    rng = np.random.default_rng(0)
+    near = np.repeat(centre, 12, axis=0) + 0.3 * rng.standard_normal((72, 4)).astype(np.float32)
+    x = jax.vmap(lambda x: jast.replay(sim, x))(jnp.asarray(near)[:, None])
+    r = explain.rules(sim, x, labels=np.repeat(list("abcdef"), 12), most=6)
+    assert r.recall["does not fail"] > 0.5 and r.precision["does not fail"] > 0.5
+    assert "nan" not in str(r)
+
+
+def test_few_failures_are_no_reason_to_judge_by_what_was_never_seen():
+    """Failures go two ways, three of them each way: where one way was held out as a whole, rules of
+    the other knew nothing of it.
+    """
+    short = lambda x: jnp.maximum(2.5 - jnp.abs(x["gust"]), 0)
+    sim = late_gust(step=lambda s, x: (s[0] + 1, jnp.where(s[0] == 4, short(x), 3.0)))
+    e = [drawn(0, 3, sim, gust=2.5), drawn(1, 3, sim, gust=-3.5)]
+    bad = jax.tree.map(lambda *a: jnp.concatenate(a), *e)
+    for seed in range(4):
+        r = explain.rules(sim, bad, episodes=100, key=jax.random.key(seed))
+        assert r.recall["fails"] > 0.8 and "nan" not in str(r)
+
+
+def test_what_is_not_known_of_a_rule_is_said_in_words():
+    r = explain.rules(SIM, drawn(0, 12, SIM, gust=2.0, delay=1.0), episodes=40)
+    rule = r.rules[0]._replace(precision=float("nan"))
+    text = str(r._replace(rules=(rule,), precision=r.precision | {"fails": float("nan")}))
+    assert text.count("precision unknown") == 2 and "nan" not in text
+
+
 @pytest.mark.long
 def test_rules_and_a_monitor_of_an_estimate(key):
     """Failures of its proposal, with their weights."""

@@ -45,7 +45,8 @@ class Rules(NamedTuple):
     classes: tuple[Any, ...]
     """What `predict` may say; the first is "does not fail"."""
     precision: dict[str, Any]
-    """Class -> of the held-out episodes that are said to be of it, the share that is."""
+    """Class -> of the held-out episodes that are said to be of it, the share that is; NaN where
+    none is."""
     recall: dict[str, Any]
     """Class -> of the held-out episodes of it, the share that is said to be."""
     held_out: dict[str, Any]
@@ -68,19 +69,16 @@ class Rules(NamedTuple):
     def __str__(self) -> str:
         lines = []
         for rule in self.rules:
-            lines.append(str(rule))
-            (a, b), (c, d) = rule.precision_interval, rule.recall_interval
-            lines.append(
-                f"    precision {rule.precision:.3f} [{a:.3f}, {b:.3f}],"
-                f" recall {rule.recall:.3f} [{c:.3f}, {d:.3f}]"
-            )
+            precision = _words(rule.precision, rule.precision_interval)
+            recall = _words(rule.recall, rule.recall_interval)
+            lines += [str(rule), f"    precision {precision}, recall {recall}"]
         if not lines:
             lines.append("no rule tells the failures from the others")
         lines.append(f"all rules, on episodes held out ({self.level:.0%} intervals above):")
         for name in self.classes:
             lines.append(
-                f"    {name:<14} precision {self.precision[name]:.3f},"
-                f" recall {self.recall[name]:.3f} of {self.held_out[name]}"
+                f"    {name:<14} precision {_words(self.precision[name])},"
+                f" recall {_words(self.recall[name])} of {self.held_out[name]}"
             )
         return "\n".join(lines)
 
@@ -128,7 +126,8 @@ def rules(
     then the failures are as probable as in the model. All that precision and recall tell is about
     episodes like these, as many failures as near misses: among ordinary episodes, of which few
     fail, a rule is less precise. Variants of one failure are held out together, unless more than a
-    quarter of the chains starts from it.
+    tenth of the chains starts from it: then rules are judged on variants of what they were made
+    from.
 
     Args:
         sim: the simulator. Without ``others`` its disturbances have quantile functions.
@@ -220,6 +219,13 @@ def rules(
 def _mean(which: np.ndarray) -> float:
     """The share that is True; NaN of none."""
     return float(which.mean()) if len(which) else float("nan")
+
+
+def _words(share: float, interval: tuple[Any, ...] = ()) -> str:
+    """ "0.950 [0.940, 0.960]" """
+    if np.isnan(share):
+        return "unknown (of no episode held out)"
+    return f"{share:.3f}" + (" [{:.3f}, {:.3f}]".format(*interval) if interval else "")
 
 
 def _ends(rng: np.random.Generator, e: Episode, ends: np.ndarray) -> np.ndarray:

@@ -26,7 +26,7 @@ __all__ = ["EACH", "draw_variants", "find_seeds"]
 SCALES = (1.0, 0.3, None, 1.0, 0.7, 1.0, None, 0.15, 1.0, 0.5)
 EACH = len(SCALES) + 2  # evaluations of a failure and its near miss: moves, and both are played
 MODES = 6  # that are told apart
-CROWDED = 0.25  # share of the chains from one seed above which seeds are not held out as a whole
+CROWDED = 0.1  # share of the chains from one seed above which seeds are not held out as a whole
 UNKNOWN_WEIGHT = -700.0  # log weight that counts only where nothing else is known
 
 
