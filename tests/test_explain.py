@@ -97,6 +97,26 @@ def test_minimal_of_a_black_box_counts_its_calls():
     assert m.evaluations - 20 < len(calls) <= m.evaluations + 3
 
 
+def test_minimal_tells_what_was_tried_from_what_was_not():
+    """Where the budget of a black box ends, what it was not asked about is not called needed."""
+
+    def run(x):
+        near = 4.6 - float(x[2]) - float(x[5])
+        return near <= 0, max(near, 0.0)
+
+    sim = jast.blackbox.from_python(run, horizon=10, disturbance=Normal(0.0, 1.0))
+    x = jnp.full(10, 0.3).at[jnp.array([2, 5, 7])].set(jnp.array([2.5, 2.2, 1.0]))
+    e = jast.replay(sim, x)
+    few, more, all_ = (explain.minimal(sim, e, budget=b) for b in (10, 14, 500))
+    # the smallest go first, and what is left is not known to be needed
+    assert [part[0] for part in few.parts] == [3, 6, 8, 9, 10] and few.untried == (0, 1, 2, 3, 4)
+    assert str(few).startswith("0 of 10 disturbances are needed: none\n5 of 10 disturbances are")
+    assert [more.parts[i][0] for i in more.untried] == [3] and not more.complete
+    assert "1 of 10 disturbances is perhaps needed, not tried: step 3\n" in str(more)
+    assert [part[0] for part in all_.parts] == [3, 6] and all_.untried == () and all_.complete
+    assert "perhaps" not in str(all_)
+
+
 def test_criticality_of_a_walk(key):
     """P(fail | s_t) = Phi((s_t - limit) / sqrt(T - t)), within 4 standard errors of 2000 draws at
     every step; the last step decides.

@@ -55,18 +55,16 @@ class Minimal(NamedTuple):
     evaluations: int
     complete: bool = True
     """False where the budget was used up: then fewer may be needed, and smaller ones."""
+    untried: tuple[int, ...] = ()
+    """Places in ``parts`` of those without which nothing was tried, as the budget was used up: they
+    may be needed or not."""
 
     def __str__(self) -> str:
-        steps = sorted({step for step, *_ in self.parts})
-        are = "is" if len(self.parts) == 1 else "are"
-        count = f"{len(self.parts)} of {self.numbers} disturbances {are} needed"
-        lines = [f"{count}: {_steps_in_words(steps)}"]
-        lines += [
-            f"  step {step:4d}  {name:<12} {value:12.5g}   {z:+.2f} sd from the mode"
-            for step, name, value, z in self.parts[:PRINTED]
-        ]
-        if len(self.parts) > PRINTED:
-            lines.append(f"  ... {len(self.parts) - PRINTED} more")
+        untried = [self.parts[i] for i in self.untried]
+        tried = [part for i, part in enumerate(self.parts) if i not in self.untried]
+        lines = [_count(tried, self.numbers, "needed"), *_lines(tried)]
+        if untried:
+            lines += [_count(untried, self.numbers, "perhaps needed, not tried"), *_lines(untried)]
         if not self.complete:
             lines.append(f"the budget was used up: {self.evaluations} evaluations")
         return "\n".join(lines)
@@ -98,8 +96,8 @@ def minimal(
             more: of a failure that was pulled to where it is likeliest none could be spared.
         budget: evaluations, at which the work ends with what it has by then. About 70 for each
             needed disturbance and order. Default: 5000; 500 of a black box, whose runs are never
-            more than the budget, at least 10. What was not looked at by then stays needed, and
-            ``complete`` says so.
+            more than the budget, at least 10. The small ones are tried first, and what was not
+            tried by then stays: ``untried`` says which, and ``complete`` whether all was done.
 
     Returns:
         `Minimal`.
@@ -125,7 +123,7 @@ def minimal(
     g = episode_point.failing_point(name, sim, episode, most=budget)
     if (farther := g._replace(v=(1 + slack) * g.v)).evaluate(farther.v[None]).failure[0]:
         g = farther
-    kept = _find_needed(g, orders, budget)
+    kept, tried = _find_needed(g, orders, budget)
     v = _shrink(g, np.where(kept, g.v, 0.0), budget)
     e = transform.played(g.sim, v[None])
     e = jax.device_get(replay(sim, index_tree(e._replace(states=None), 0)))
@@ -139,11 +137,14 @@ def minimal(
         numbers=int(g.outcome.used[0]),
         evaluations=g.evaluate.spent,
         complete=g.evaluate.spent < budget,
+        untried=tuple(np.flatnonzero(~tried[kept]).tolist()),
     )
 
 
-def _find_needed(g: EpisodePoint, orders: int, budget: int) -> np.ndarray:
-    """[D] bool: the fewest numbers that are not 0 at the end of any order."""
+def _find_needed(g: EpisodePoint, orders: int, budget: int) -> tuple[np.ndarray, np.ndarray]:
+    """([D] bool: the fewest numbers that are not 0 at the end of any order, [D] bool: those without
+    which it was tried).
+    """
     rng = np.random.default_rng(0)
     size = np.abs(g.v)
     live = np.flatnonzero(size)
@@ -153,34 +154,47 @@ def _find_needed(g: EpisodePoint, orders: int, budget: int) -> np.ndarray:
     points = np.tile(g.v, (orders, 1))
     # of each order what lies before ``at`` is decided
     at = np.zeros(orders, int)
-    while (at < len(live)).any() and g.evaluate.spent < budget:
-        points, at = _advance(g, points, order, at)
+    for rows in (slice(1), slice(orders)):  # the order by size is through before the others begin
+        while (at[rows] < len(live)).any() and g.evaluate.spent < budget:
+            points[rows], at[rows] = _advance(g, points[rows], order[rows], at[rows])
     counts = (points != 0).sum(axis=1)
-    best = points[np.lexsort(((points**2).sum(axis=1), counts))[0]]
-    return _spare_one_by_one(g, best, budget) != 0
+    best = np.lexsort(((points**2).sum(axis=1), counts))[0]
+    tried = np.zeros(len(g.v), bool)
+    tried[order[best, : at[best]]] = True
+    return _spare_one_by_one(g, points[best], tried, budget)
+
+
+def _fails(g: EpisodePoint, points: np.ndarray) -> np.ndarray:
+    """Whether the ``points`` fail; of a black box the first ones, those its budget affords."""
+    before = g.evaluate.spent
+    return g.evaluate(points).failure[: g.evaluate.spent - before]
 
 
 def _advance(g: EpisodePoint, points: np.ndarray, order: np.ndarray, at: np.ndarray):
     """Put back as much of what comes next in each order as can be in one piece; the number behind
-    the piece stays.
+    the piece stays, where it was tried.
     """
     n = order.shape[1]
-    low, high = at.copy(), np.full(len(at), n)  # all before low can be spared, not all before high
+    # all before low can be spared, not all before high; n + 1: that is not known
+    low, high = at.copy(), np.full(len(at), n + 1)
     rows = np.flatnonzero(at < n)
     first = True
     while len(rows):
-        ends = [np.unique(np.linspace(low[i], high[i], SECTIONS + 1).round()) for i in rows]
-        tried = [e.astype(int)[1 : None if first else -1] for e in ends]
+        ends = [np.linspace(low[i], min(high[i], n), SECTIONS + 1).round() for i in rows]
+        tried = [np.unique(e).astype(int)[1 : None if first else -1] for e in ends]
         batch = [_at_mode(points[i], order[i, at[i] : e]) for i, t in zip(rows, tried) for e in t]
-        fails = iter(g.evaluate(np.stack(batch)).failure)
+        fails = _fails(g, np.stack(batch))
+        known = iter(fails)
         for i, t in zip(rows, tried):
-            good = [e for e in t if next(fails)]
-            low[i] = max(good, default=low[i])
-            high[i] = min((e for e in t if e > low[i]), default=high[i] if low[i] < high[i] else n)
+            said = list(zip(t, known))  # fewer than t where the budget ends
+            low[i] = max((e for e, failing in said if failing), default=low[i])
+            high[i] = min((e for e, _ in said if e > low[i]), default=high[i])
+        if len(fails) < len(batch):
+            break
         rows, first = rows[high[rows] - low[rows] > 1], False
-    for i in np.flatnonzero(at < n):
+    for i in range(len(at)):
         points[i] = _at_mode(points[i], order[i, at[i] : low[i]])
-    return points, np.where(at < n, np.minimum(low + 1, n), at)
+    return points, np.where(high - low == 1, np.minimum(low + 1, n), low)
 
 
 def _at_mode(point: np.ndarray, which: np.ndarray) -> np.ndarray:
@@ -189,16 +203,18 @@ def _at_mode(point: np.ndarray, which: np.ndarray) -> np.ndarray:
     return out
 
 
-def _spare_one_by_one(g: EpisodePoint, point: np.ndarray, budget: int) -> np.ndarray:
-    """``point`` without what can be spared one by one."""
+def _spare_one_by_one(g: EpisodePoint, point: np.ndarray, tried: np.ndarray, budget: int):
+    """(bool [D]: those of ``point`` that cannot be spared one by one, ``tried`` with these)."""
     while g.evaluate.spent < budget and (left := np.flatnonzero(point)).size:
+        left = left[np.argsort(np.abs(point[left]))]
         each = np.tile(point, (len(left), 1))
         each[np.arange(len(left)), left] = 0.0
-        fails = g.evaluate(each).failure
+        fails = _fails(g, each)
+        tried[left[: len(fails)]] = True
         if not fails.any():
             break
-        point = each[fails][np.argmax(np.abs(point[left[fails]]))]
-    return point
+        point = each[np.flatnonzero(fails)[-1]]
+    return point != 0, tried
 
 
 def _shrink(g: EpisodePoint, point: np.ndarray, budget: int) -> np.ndarray:
@@ -242,6 +258,21 @@ def _parts(sim: Simulator, e: Episode, v: np.ndarray, kept: np.ndarray) -> tuple
     return tuple(
         (int(steps[i]), called[i], float(values[i]), float(v[i])) for i in np.flatnonzero(kept)
     )
+
+
+def _count(parts: list, numbers: int, needed: str) -> str:
+    """ "3 of 50 disturbances are needed: steps 4 to 6" """
+    steps = _steps_in_words(sorted({step for step, *_ in parts}))
+    are = "is" if len(parts) == 1 else "are"
+    return f"{len(parts)} of {numbers} disturbances {are} {needed}: {steps}"
+
+
+def _lines(parts: list) -> list[str]:
+    lines = [
+        f"  step {step:4d}  {name:<12} {value:12.5g}   {z:+.2f} sd from the mode"
+        for step, name, value, z in parts[:PRINTED]
+    ]
+    return lines + ([f"  ... {len(parts) - PRINTED} more"] if len(parts) > PRINTED else [])
 
 
 def _steps_in_words(steps: list) -> str:
