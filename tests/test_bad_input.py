@@ -83,6 +83,26 @@ def swept(values, *args, **options):
             "Geometric: probs must lie between 0 and 1",
         ),
         (lambda key: jast.distributions.Binomial(3.0, jnp.asarray(2.0)), "Binomial: probs must"),
+        *(
+            (
+                lambda key, family=family, given=given: getattr(jast.distributions, family)(*given),
+                words,
+            )
+            for family, given, words in [
+                ("Poisson", (-1.0,), "Poisson: rate must be at least 0, received -1.0"),
+                ("Normal", (0.0, np.array([1.0, -2.0])), "Normal: scale must be at least 0"),
+                ("Laplace", (0.0, -1.0), "Laplace: scale must"),
+                ("StudentT", (-2.0,), "StudentT: df must"),
+                ("Exponential", (jnp.asarray(-1.0),), "Exponential: rate must"),
+                ("Weibull", (-1.0, 1.0), "Weibull: concentration must"),
+                ("Gamma", (2.0, -1.0), "Gamma: rate must"),
+                ("Beta", (-2.0, 1.0), "Beta: alpha must"),
+                ("Binomial", (-3.0, 0.5), "Binomial: total_count must"),
+                ("Categorical", (None, np.array([1.5, -0.5])), "Categorical: probs must"),
+                ("Uniform", (1.0, 0.0), "Uniform: high must be at least 1.0, received 0.0"),
+                ("TruncatedNormal", (0.0, 1.0, 2.0, 1.0), "TruncatedNormal: high must"),
+            ]
+        ),
         (lambda key: jast.explain.criticality(key, SIM, 3), "criticality: episode cannot be"),
         (lambda key: jast.explain.differential(key, SIM, 3), "differential: sim must be a"),
         (lambda key: jast.nominal(key, SIM, devices="cpu"), "devices must be .*received .'cpu'"),

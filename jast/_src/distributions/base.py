@@ -22,7 +22,7 @@ __all__ = [
     "broadcast",
     "float_array",
     "is_distribution",
-    "probability_array",
+    "parameter_array",
     "tree_map",
 ]
 
@@ -177,15 +177,18 @@ def float_array(x: Any) -> Any:
     raise ValueError(f"a distribution's numbers: expected floats or integers, received {x.dtype}")
 
 
-def probability_array(name: str, probs: Any) -> Any:
-    """`float_array` of probabilities of the family ``name``.
+def parameter_array(name: str, x: Any, low: Any = 0, high: float = np.inf) -> Any:
+    """`float_array` of the parameter ``name``, such as "Poisson: rate".
 
     Raises:
-        ValueError: where they are known, and one lies outside of [0, 1].
+        ValueError: where it is known, and some of it lies outside of [low, high].
     """
-    array, known = float_array(probs), None if is_traced(probs) else np.asarray(probs, float)
-    if known is not None and ((known < 0) | (known > 1)).any():
-        raise ValueError(f"{name}: probs must lie between 0 and 1, received {probs}")
+    array = float_array(x)
+    if not is_traced(array, low):
+        known = np.asarray(array, float)
+        if ((known < np.asarray(low)) | (known > high)).any():
+            words = f"lie between {low} and {high}" if high < np.inf else f"be at least {low}"
+            raise ValueError(f"{name} must {words}, received {x}")
     return array
 
 

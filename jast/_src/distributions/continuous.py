@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jax.lax import lgamma
 
 from jast._src.core.typing import Array, ArrayTree, Numeric, PRNGKey
-from jast._src.distributions.base import Elementwise, broadcast, float_array
+from jast._src.distributions.base import Elementwise, broadcast, float_array, parameter_array
 from jast._src.distributions.normal import Symmetric
 from jast._src.distributions.tables import numbers
 
@@ -87,7 +87,8 @@ class Uniform(Elementwise):
     high: jax.Array = broadcast("_high")
 
     def __init__(self, low: ArrayTree = 0.0, high: ArrayTree = 1.0) -> None:
-        self._low, self._high = float_array(low), float_array(high)
+        self._low = float_array(low)
+        self._high = parameter_array("Uniform: high", high, self._low)
 
     @property
     def range(self) -> jax.Array:
@@ -128,10 +129,11 @@ class _Pair(Elementwise):
     """Of two positive parameters that broadcast."""
 
     _parameters = "_a", "_b"
+    _words: tuple[str, str]
 
     def __init__(self, a: Numeric, b: Numeric) -> None:
-        self._a: jax.Array = float_array(a)
-        self._b: jax.Array = float_array(b)
+        self._a: jax.Array = parameter_array(f"{self.name}: {self._words[0]}", a)
+        self._b: jax.Array = parameter_array(f"{self.name}: {self._words[1]}", b)
         self._known_numbers = numbers(a, b)
 
 
@@ -144,6 +146,8 @@ class Gamma(_Pair):
         >>> float(d.mean())
         0.5
     """
+
+    _words = "concentration", "rate"
 
     def __init__(self, concentration: Numeric, rate: Numeric) -> None:
         super().__init__(concentration, rate)
@@ -182,6 +186,8 @@ class Beta(_Pair):
         >>> float(d.mean())
         0.5
     """
+
+    _words = "alpha", "beta"
 
     def __init__(self, alpha: Numeric, beta: Numeric) -> None:
         super().__init__(alpha, beta)

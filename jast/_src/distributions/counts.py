@@ -15,7 +15,7 @@ from jax.lax import lgamma, stop_gradient
 from jax.scipy.special import betainc, gammainc, gammaincc, xlog1py
 
 from jast._src.core.typing import Array, Numeric, PRNGKey
-from jast._src.distributions.base import Elementwise, float_array, probability_array
+from jast._src.distributions.base import Elementwise, parameter_array
 from jast._src.distributions.continuous import log_power
 from jast._src.distributions.family_table import register
 from jast._src.distributions.normal_tails import (
@@ -158,7 +158,7 @@ class Geometric(_Counts):
     """
 
     def __init__(self, probs: Numeric) -> None:
-        self.probs: jax.Array = probability_array(self.name, probs)
+        self.probs: jax.Array = parameter_array(f"{self.name}: probs", probs, 0, 1)
         self._parameter = self.probs
 
     def _place(self, below, above):
@@ -190,7 +190,7 @@ class Poisson(_Counts):
     """
 
     def __init__(self, rate: Numeric) -> None:
-        self.rate: jax.Array = float_array(rate)
+        self.rate: jax.Array = parameter_array("Poisson: rate", rate)
         self._parameter, self._known_numbers = self.rate, numbers(rate)
 
     @property
@@ -261,8 +261,10 @@ class Binomial(_Counts):
     _parameters = "total_count", "probs"
 
     def __init__(self, total_count: Numeric, probs: Numeric) -> None:
-        self.probs: jax.Array = probability_array(self.name, probs)
-        self.total_count: jax.Array = jnp.asarray(total_count, self.probs.dtype)
+        self.probs: jax.Array = parameter_array(f"{self.name}: probs", probs, 0, 1)
+        self.total_count: jax.Array = jnp.asarray(
+            parameter_array("Binomial: total_count", total_count), self.probs.dtype
+        )
         self._parameter, self._known_numbers = self.probs, numbers(total_count, probs)
 
     @property

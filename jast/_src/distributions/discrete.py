@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 
 from jast._src.core.typing import Array, Numeric, PRNGKey
-from jast._src.distributions.base import Distribution, float_array, probability_array
+from jast._src.distributions.base import Distribution, float_array, parameter_array
 
 __all__ = ["Bernoulli", "Categorical"]
 
@@ -60,7 +60,7 @@ class Bernoulli(_Choice):
         dtype: Any = int,
     ) -> None:
         self._check(logits, probs, dtype, jnp.bool_, jnp.integer, jnp.floating)
-        self._probs = None if probs is None else probability_array(self.name, probs)
+        self._probs = None if probs is None else parameter_array("Bernoulli: probs", probs, 0, 1)
         self._logits = None if logits is None else float_array(logits)
 
     @property
@@ -117,7 +117,7 @@ class Categorical(_Choice):
         self._check(logits, probs, dtype, jnp.integer, jnp.floating)
         self._logits = self._probs = None
         if logits is None:
-            probs = jnp.asarray(probs)
+            probs = parameter_array("Categorical: probs", jnp.asarray(probs))
             self._probs = probs / probs.sum(axis=-1, keepdims=True)
         else:
             self._logits = jax.nn.log_softmax(jnp.asarray(logits), axis=-1)

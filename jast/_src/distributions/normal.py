@@ -10,7 +10,13 @@ import jax
 import jax.numpy as jnp
 
 from jast._src.core.typing import Array, Numeric, PRNGKey
-from jast._src.distributions.base import Distribution, Elementwise, broadcast, float_array
+from jast._src.distributions.base import (
+    Distribution,
+    Elementwise,
+    broadcast,
+    float_array,
+    parameter_array,
+)
 from jast._src.distributions.normal_tails import HALF_LOG_2PI, ndtr
 
 __all__ = [
@@ -31,7 +37,7 @@ class LocationScale(Elementwise):
 
     def __init__(self, loc: Numeric, scale: Numeric) -> None:
         self._loc: jax.Array = float_array(loc)
-        self._scale: jax.Array = float_array(scale)
+        self._scale: jax.Array = parameter_array(f"{self.name}: scale", scale)
 
     def _standardize(self, value):
         return (value - self._loc) / self._scale

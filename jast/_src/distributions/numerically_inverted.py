@@ -17,7 +17,7 @@ from jax.lax import lgamma, stop_gradient
 from jax.scipy.special import betainc, betaln, erfinv
 
 from jast._src.core.typing import Array, Numeric, PRNGKey
-from jast._src.distributions.base import Distribution, broadcast, float_array
+from jast._src.distributions.base import Distribution, broadcast, parameter_array
 from jast._src.distributions.family_table import register, register_both
 from jast._src.distributions.log_tail_rows import log_tails_of, of_inverse
 from jast._src.distributions.normal import Symmetric
@@ -123,7 +123,7 @@ class StudentT(Symmetric):
 
     def __init__(self, df: Numeric, loc: Numeric = 0.0, scale: Numeric = 1.0) -> None:
         super().__init__(loc, scale)
-        self._df = float_array(df)
+        self._df = parameter_array("StudentT: df", df)
         self._known_numbers = numbers(df)
 
     def _sample_n(self, key: PRNGKey, n: int) -> Any:

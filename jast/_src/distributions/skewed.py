@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 
 from jast._src.core.typing import Array, ArrayTree, Numeric, PRNGKey
-from jast._src.distributions.base import Elementwise, broadcast, float_array
+from jast._src.distributions.base import Elementwise, broadcast, float_array, parameter_array
 from jast._src.distributions.continuous import log_power
 from jast._src.distributions.family_table import register, register_both
 from jast._src.distributions.log_tail_rows import of_log_tails
@@ -81,7 +81,7 @@ class Exponential(Elementwise):
     _parameters = ("rate",)
 
     def __init__(self, rate: Numeric) -> None:
-        self.rate: jax.Array = float_array(rate)
+        self.rate: jax.Array = parameter_array("Exponential: rate", rate)
 
     def _sample_n(self, key: PRNGKey, n: int) -> Any:
         return jax.random.exponential(key, (n, *self.rate.shape), self.rate.dtype) / self.rate[None]
@@ -155,7 +155,8 @@ class Weibull(Elementwise):
     scale: jax.Array = broadcast("_scale")
 
     def __init__(self, concentration: Numeric, scale: Numeric) -> None:
-        self._shape, self._scale = float_array(concentration), float_array(scale)
+        self._shape = parameter_array("Weibull: concentration", concentration)
+        self._scale = parameter_array("Weibull: scale", scale)
 
     def _sample_n(self, key: PRNGKey, n: int) -> Any:
         k, scale = self.concentration, self.scale
@@ -204,7 +205,8 @@ class TruncatedNormal(LocationScale):
 
     def __init__(self, loc: Numeric, scale: Numeric, low: ArrayTree, high: ArrayTree) -> None:
         super().__init__(loc, scale)
-        self._low, self._high = float_array(low), float_array(high)
+        self._low = float_array(low)
+        self._high = parameter_array("TruncatedNormal: high", high, self._low)
 
     def ends(self) -> tuple[jax.Array, jax.Array, jax.Array]:
         """(low, high) in standard deviations from loc, and the log of the mass between them."""
