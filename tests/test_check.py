@@ -624,6 +624,16 @@ def test_a_state_that_is_copied_is_not_changed():
     )
 
 
+def test_a_function_of_too_many_arguments_is_named_with_its_line():
+    def step(s, x, key):
+        return s
+
+    line = step.__code__.co_firstlineno
+    for given in (step, Partial(step)):
+        with pytest.raises(ValueError, match=rf"^step: raised TypeError \(test_check.py:{line}\):"):
+            jast.check(boxed(step=given))
+
+
 def test_a_step_may_empty_its_own_state():
     jast.check(boxed(step=lambda s, x: {"at": 0.5 * s.pop("at") + 0.3 * x}))
 

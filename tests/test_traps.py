@@ -32,6 +32,11 @@ def test_good_systems_have_none():
         assert traps(sim) == []
 
 
+def test_an_episode_that_is_over_before_it_begins_is_told():
+    sim = dataclasses.replace(walk(), is_terminal=lambda s: jnp.ones((), bool))
+    assert any(text.startswith("is_terminal: holds at the start") for text in traps(sim))
+
+
 def pole(resets, at_random=False):
     """The cart-pole of Barto, Sutton and Anderson under bang-bang control by noisy readings, and a
     count of its steps; one in some hundred episodes ends. ``resets``: as many environments do, it

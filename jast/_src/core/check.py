@@ -11,6 +11,8 @@ from __future__ import annotations
 import math
 import operator
 import warnings
+from functools import partial
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -71,6 +73,7 @@ def check(sim: Simulator, actions: Actions | None = None) -> Simulator:
      - the state jumps back to its start, three times as far as it ever moved in a step, as of an
        environment that resets itself;
      - the state holds a random key that no disturbance reaches;
+     - ``is_terminal`` holds at every start;
      - `jax.lax.stop_gradient` leaves the miss distance without a slope;
      - the step is so large that it takes minutes to compile.
 
@@ -203,7 +206,8 @@ def _call(name, function, *args):
 
         kind = type(e).__name__
         hint = HINTS.get(kind, NO_START if name == "init" and args == ((),) else "")
-        raise ValueError(f"{name}: raised {kind}{line_of(e)}: {_first_line(e)}{hint}") from e
+        where = line_of(e) or _line_of_definition(function)
+        raise ValueError(f"{name}: raised {kind}{where}: {_first_line(e)}{hint}") from e
     if looks and _differ(before, given):
         raise ValueError(
             f"{name}: changes the state that it is given, which others look at, too: it must leave"
@@ -212,6 +216,14 @@ def _call(name, function, *args):
     if found is None and name in ("init", "step"):
         raise ValueError(f"{name}: returned None: is a return missing?")
     return found
+
+
+def _line_of_definition(function):
+    """ " (system.py:12)", of a function that was not entered; "" where Python does not know."""
+    while isinstance(function, partial):
+        function = function.func
+    code = getattr(function, "__code__", None)
+    return f" ({Path(code.co_filename).name}:{code.co_firstlineno})" if code else ""
 
 
 def _differ(before, tree):

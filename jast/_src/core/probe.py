@@ -64,6 +64,8 @@ class Resolution(NamedTuple):
     """bool: whether the miss distance does."""
     jump: Array
     """The first step at which a state jumps back to its start; 0 where none does."""
+    ended: Array
+    """bool: ``is_terminal`` holds at every start."""
 
 
 class Probe(NamedTuple):
@@ -231,7 +233,9 @@ def _probe(sim: Simulator) -> Probe:
     company = last.company
     if sim.episodic:
         company = company._replace(distance=of_starts(distance))
-    return found._replace(resolution=_resolution(company, index_tree(of_start[0], np.s_[:-1])))
+    starting = index_tree(of_start[0], np.s_[:-1])
+    ended = jnp.all(jax.vmap(sim.is_terminal, axis_size=starts)(starting))
+    return found._replace(resolution=_resolution(company, starting, ended))
 
 
 def _company(states: Any, distance: jax.Array) -> _Company:
@@ -285,7 +289,7 @@ def _follow(
     )
 
 
-def _resolution(c: _Company, starts: Any) -> Resolution:
+def _resolution(c: _Company, starts: Any, ended: jax.Array) -> Resolution:
     """By the company of all starts, whose states were ``starts``."""
     gap = c.distance[:, UNIT_OFF] - c.distance[:, PLAIN]
     gap = jnp.where(jnp.isfinite(gap), gap, 0)
@@ -306,6 +310,7 @@ def _resolution(c: _Company, starts: Any) -> Resolution:
         differ=jnp.any(c.differ),
         distance_differs=jnp.any(c.distance[:, OTHER] != c.distance[:, PLAIN]),
         jump=jnp.where(first_jump < NEVER, first_jump, 0),
+        ended=ended,
     )
 
 

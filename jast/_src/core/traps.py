@@ -34,6 +34,11 @@ def traps(sim: Simulator, seen: Resolution) -> list[str]:
     """
     signature, (equations, level, keys) = signature_of(sim), _program(sim)
     found = [f"step: {text}" for text in (describe(sim, seen), _jumps(seen)) if text is not None]
+    if seen.ended:
+        found.append(
+            "is_terminal: holds at the start of every episode, which ends there, before any step;"
+            " it must be False while an episode goes on"
+        )
     found += _fixed_keys(signature.state, seen, keys)
     if seen.distance_differs and level:
         found.append(
