@@ -18,7 +18,7 @@ import jast
 from jast._src.core.failures import empty
 from jast._src.page import document, episode_data, report
 from jast._src.search.refine.modes import Modes
-from jast._src.stress_testing.report_words import share_of_runs, two_digits
+from jast._src.stress_testing.report_words import advice, share_of_runs, two_digits
 from jast.distributions import Normal
 from jast.explain import Criticality, Minimal
 
@@ -34,6 +34,14 @@ def page(tmp_path_factory):
     told = [[EVIL, risk, None, least]]
     made().html(path, draw=lambda s: f"<svg>{float(s.speed)}|{EVIL}", explanations=told)
     return path.read_text(encoding="utf-8")
+
+
+def test_advice_fits_a_black_box():
+    """Subset simulation takes some ten thousand runs."""
+    doubtful = made(probability=estimate(reliable=False, warnings=("few",)))
+    box = jast.blackbox.from_python(lambda x: (False, 1.0), horizon=1, disturbance=Normal(0.0, 1.0))
+    assert "larger budget, or jast.estimate.subset_simulation, for" in advice(doubtful)
+    assert advice(doubtful._replace(sim=box)).endswith("; a larger budget for the probability")
 
 
 def test_a_page_stands_alone_and_lets_nothing_out(page):

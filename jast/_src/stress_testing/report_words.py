@@ -8,7 +8,7 @@ import numpy as np
 
 from jast._src.core.nominal import describe_undisturbed
 from jast._src.estimate.estimate import guaranteed_words, is_doubtful
-from jast._src.runtime.host_errors import incidents
+from jast._src.runtime.host_errors import incidents, runs_on_host
 
 __all__ = [
     "advice",
@@ -233,5 +233,7 @@ def advice(r: Any) -> str:
         )
     words = ["next: jast.replay(sim, report.failures[0]) for its states"]
     if r.probability is not None and not r.probability.reliable:
-        words.append("a larger budget, or jast.estimate.subset_simulation, for the probability")
+        hosted = r.sim is not None and runs_on_host(r.sim)  # some ten thousand runs are too dear
+        other = "" if hosted else ", or jast.estimate.subset_simulation,"
+        words.append(f"a larger budget{other} for the probability")
     return "; ".join(words)
