@@ -9,11 +9,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.tree_util import Partial
 from systems import mark_long
 
 import jast
 from jast._src.core.policy import nominal_policy
 from jast._src.util import display
+from jast.distributions import Normal
 
 KEY = jax.random.key(0)
 
@@ -83,6 +85,34 @@ OTHERS = {
 @functools.cache
 def made(name):
     return (MAKERS | OTHERS)[name]()
+
+
+def test_a_file_of_another_simulator_is_told(tmp_path):
+    """One of the same shapes, with other parameters: its failures are not failures, are over at
+    another time, or are of another density. What fits is loaded in silence.
+    """
+
+    def walk(limit=3.0, scale=1.0):
+        return jast.Simulator(
+            init=lambda x0: jnp.zeros(()),
+            step=lambda s, x: s + x,
+            disturbance=Partial(lambda scale, s: Normal(0.0, scale), jnp.asarray(scale)),
+            evaluate=Partial(lambda at, s: (s >= at, jnp.maximum(at - s, 0)), jnp.asarray(limit)),
+            horizon=5,
+        )
+
+    e = jast.replay(walk(), jnp.asarray([0.5, 1.5, 0.6, 0.6]))
+    assert e.failure and e.length == 4
+    path = tmp_path / "one.npz"
+    jast.save(path, e)
+    assert jast.load(path, walk()).failure and jast.load(path).failure
+    for sim, words in [
+        (walk(limit=100.0), "no longer fails"),
+        (walk(limit=2.0), "fails after 2 steps, not 4"),
+        (walk(scale=2.0), "has log p"),
+    ]:
+        with pytest.warns(UserWarning, match=f"load: the best failure in .* {words}"):
+            jast.load(path, sim)
 
 
 @pytest.mark.slow

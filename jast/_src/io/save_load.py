@@ -7,13 +7,15 @@ a version and a checksum (`io.npz`), and the result itself as `io.codec` has it.
 from __future__ import annotations
 
 import importlib
+import warnings
 from typing import Any
 
 import numpy as np
 
 from jast._src.core.typing import PathLike
 from jast._src.io import former_files, npz
-from jast._src.io.codec import Given, check_episodes, decode, encode, place_of
+from jast._src.io.codec import Given, check_episodes, decode, encode, name_of, place_of
+from jast._src.runtime.host_errors import runs_on_host
 from jast._src.util.checks import check_path
 
 __all__ = [
@@ -68,7 +70,8 @@ def load(path: PathLike, sim: Any = None, *, heads: Any = None) -> Any:
         path: of the file. Files of version 0.1.0 can be read too.
         sim: the simulator of the result, which must fit it (horizon, structure, shapes, kinds of
             number; the float precision may differ). A failure policy needs it, and so do x0, x and
-            states that hold classes of their own.
+            states that hold classes of their own. Its best failure is played again (not of a black
+            box): a warning says where it is another episode than it was.
         heads: `jast.heads.Heads` with functions of your own, for a file that holds such heads. Its
             functions are taken, and the file's parameters must be like its own.
 
@@ -99,7 +102,41 @@ def restore(path: Any, sim: Any = None, heads: Any = None) -> tuple[Any, dict[st
     header, arrays = npz.read(path, FORMATS, KIND)
     header = former_files.translate(header)
     beside = {k: decode(v, path, arrays, Given()) for k, v in header["beside"].items()}
-    return whole(path, header, arrays, sim, heads), beside
+    result = whole(path, header, arrays, sim, heads)
+    if sim is not None:
+        _warn_of_another(path, sim, result)
+    return result, beside
+
+
+def _warn_of_another(path: Any, sim: Any, result: Any) -> None:
+    """Warn where the best failure in a result is not the same episode with ``sim``. A system on the
+    host is not run.
+    """
+    from jast._src.core.episode import replay  # whose module uses what files use
+
+    held = result.failures if "failures" in getattr(result, "_fields", ()) else result
+    if name_of(held) == "Failures" and np.ndim(held.episodes.length) == 1:
+        held = held.best
+    if name_of(held) != "Episode" or np.ndim(held.length) or not held.failure:
+        return
+    if runs_on_host(sim):
+        return
+    again = replay(sim, held)
+    there, here = held.log_prob.item(), again.log_prob.item()
+    if not again.failure:
+        said = "no longer fails"
+    elif again.length != held.length:
+        said = f"fails after {again.length} steps, not {held.length},"
+    elif not np.isclose(there, here, 1e-3, 1e-3):
+        said = f"has log p {here:.6g}, not {there:.6g},"
+    else:
+        return
+    warnings.warn(
+        f"load: the best failure in {path} {said} with this simulator, which has other"
+        " parameters or functions than the one it was found with (or floats of another precision)",
+        UserWarning,
+        stacklevel=4,
+    )
 
 
 def check_kind(path: Any, value: Any, kind: type) -> None:
