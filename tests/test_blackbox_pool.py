@@ -101,6 +101,23 @@ def test_what_hangs_or_dies_costs_its_own_row_only():
     assert gone(pids)
 
 
+@pytest.mark.parametrize("limit", [None, 1.0])
+def test_what_a_worker_had_answered_before_it_died_is_kept(tmp_path, limit):
+    """Each run is made once, whoever ends its process: the killer's, too."""
+    log = tmp_path / "runs"
+
+    def deadly(disturbances):
+        with log.open("a") as file:
+            file.write(f"{disturbances[0]:g}\n")
+        return blackboxes.troubled(disturbances)
+
+    sim, first = box(deadly, time_limit=limit), np.r_[10.0:17.0, 4, 1, 30.0:42.0, 4.25, 50.0:53.0]
+    np.testing.assert_array_equal(ends(sim, first), np.where(first < 10, np.nan, first))
+    assert sorted(map(float, log.read_text().split())) == sorted(first)
+    assert blackbox.calls(sim).episodes == len(first)
+    assert {(i.kind, i.count) for i in incidents(sim)} == {("died", 2), ("raised", 1)}
+
+
 @pytest.mark.slow
 def test_a_hang_costs_one_time_limit_whatever_else_its_worker_was_given():
     sim, first = box(blackboxes.troubled, workers=1), np.r_[10.0:70.0, 3, 10.0:70.0]

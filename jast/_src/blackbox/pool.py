@@ -12,6 +12,7 @@ import time
 import weakref
 from collections import deque
 from concurrent.futures import FIRST_COMPLETED, wait
+from functools import partial
 from multiprocessing.util import Finalize
 from typing import NamedTuple
 
@@ -25,6 +26,7 @@ __all__ = ["Pool", "pack"]
 NEEDS = "jast.blackbox with workers >= 1"
 GRACE = 1.0  # seconds that a worker has beyond the time limit of what it runs before it is killed
 START = 60.0  # seconds that a worker may take to start, and to load the system
+TRIES = 3  # at a piece that a worker does not begin, until its first row is at fault
 PIECE = 0.01  # seconds of work in a piece, at least, where that leaves no worker idle
 
 
@@ -84,7 +86,8 @@ class Worker:
     """One process, started on first use and started anew after its end."""
 
     def __init__(self, payload):
-        self.payload, self.executor, self.at = payload, None, None
+        self.payload, self.executor, self.at, self.file = payload, None, None, None
+        self.unbegun = 0  # pieces that it was given and lost before it began any, in a row
 
     def start(self):
         """A future that is done when the process has the system."""
@@ -93,16 +96,23 @@ class Worker:
             self.executor = loky.ProcessPoolExecutor(max_workers=1, timeout=None)
             return self.executor.submit(pickle.loads, self.payload)
 
-    def configure(self, x, size, timed):
-        """``timed``: it is to say when what it runs began, in a file that both map."""
-        if not timed or self.at is not None:
+    def configure(self, x, size):
+        """It is to say in a file when what it runs began, and what each row came to."""
+        if self.at is not None:
             self.executor.submit(CONFIGURE, x, size)
             return
         handle, name = tempfile.mkstemp(prefix="jast-")
-        os.close(handle)
+        self.file = os.fdopen(handle, "rb")
         self.at = np.memmap(name, np.float64, "w+", shape=2)
         self.executor.submit(CONFIGURE, x, size, name).result(timeout=START)
-        self._forget_file()  # both have mapped it
+        self._forget_file()  # both have it open
+
+    def finished(self):
+        """(place, outcome, problems, episodes, transitions so far) of each row that it has finished
+        of what it was given last.
+        """
+        self.file.seek(worker.HEAD)
+        return list(iter(partial(pickle.load, self.file), None))
 
     def kill(self):
         executor, self.executor = self.executor, None
@@ -110,6 +120,7 @@ class Worker:
             executor.shutdown(wait=False, kill_workers=True)
         if self.at is not None:
             self._forget_file()
+            self.file.close()
             self.at = None
 
     def _forget_file(self):
@@ -137,9 +148,9 @@ class Pool:
     """A `worker.Runner` whose rows are shared out over processes.
 
     Episodes go in pieces to whoever is free; the rows of a system of kept objects stay with their
-    worker. A worker that dies is replaced; its rows then run one by one, and the one that does it
-    again is the culprit. So is one of which a part runs for longer than the time limit and `GRACE`;
-    it costs these and a start of a process, and the others of its piece run again.
+    worker. A worker that dies is replaced, and the row that ran is the culprit. So is one of which a
+    part runs for longer than the time limit and `GRACE`; it costs these and a start of a process.
+    What the worker had answered by then is kept, and the rest of its piece runs in another one.
     """
 
     def __init__(self, payload, workers, spec, x=0, size=0, system=None):
@@ -160,7 +171,7 @@ class Pool:
         self.x, self.size = x, size
         for w in self.workers:
             if w.executor is not None:
-                w.configure(x, size, self.spec.limit)
+                w.configure(x, size)
 
     def probe(self, x0):
         """As `worker.Runner.probe`, in the first worker."""
@@ -194,22 +205,23 @@ class Pool:
         free, busy = set(self.workers), {}
         try:
             while busy or any(queues):
-                given = [
+                tasks = [
                     (w, queue, queue.popleft())
                     for w, queue in zip(self.workers, queues)
                     if w in free and queue
                 ]
-                self._start([w for w, _, _ in given])
-                for w, queue, rows in given:
+                self._start([w for w, _, _ in tasks])
+                for w, queue, rows in tasks:
                     longest = t[rows].max()
                     leaves = [a[rows] for a in x0], [a[rows, :longest] for a in xs]
+                    given = time.monotonic()  # before it may begin
                     try:
                         task = w.executor.submit(SERVE, t[rows], *leaves)
                     except Exception:  # it died while it had nothing to do
                         w.kill()
                         self._start([w])
                         task = w.executor.submit(SERVE, t[rows], *leaves)
-                    busy[task] = _Piece(w, queue, rows, time.monotonic())
+                    busy[task] = _Piece(w, queue, rows, given)
                     free.remove(w)
                 first = min(self._running(piece)[1] for piece in busy.values())
                 patience = None if first == np.inf else max(0.0, first - time.monotonic())
@@ -227,25 +239,39 @@ class Pool:
                     if task in done:
                         try:
                             reply = _merge(reply, piece.rows, worker.Reply(*task.result()))
+                            piece.worker.unbegun = 0
                             continue
                         except Exception as error:
                             problem = "died", _cause(error)
-                    culprit = late.get(task)
-                    piece.worker.kill()
-                    if culprit is None and len(piece.rows) > 1:  # one by one, which finds it
-                        piece.queue.extendleft(piece.rows[::-1, None])
-                        continue
-                    row = int(piece.rows[culprit or 0])
-                    reply.terminal[row] = True
-                    reply.problems.append((row, *problem))
-                    if len(piece.rows) > 1:
-                        piece.queue.appendleft(piece.rows[piece.rows != row])
+                    row = late[task] if task in late else self._running(piece)[0]
+                    reply = self._salvage(reply, piece, row, problem)
         except BaseException:  # an interruption: what still runs must not answer the next call
             _close(self.workers)
             raise
         if n:
             self.pace = reply.seconds / n
         return reply
+
+    def _salvage(self, reply, piece, row, problem):
+        """``reply`` with what a worker had answered of its piece before the row at this place ended
+        it, which had this ``problem``; None: before any began. The others go back to their queue.
+        """
+        finished = [] if row is None else piece.worker.finished()
+        piece.worker.kill()
+        piece.worker.unbegun = piece.worker.unbegun + 1 if row is None else 0
+        if 0 < piece.worker.unbegun < TRIES:  # it died while it had nothing to do
+            piece.queue.appendleft(piece.rows)
+            return reply
+        places, row, counts = [f[0] for f in finished], row or 0, (0, 0)
+        for place, found, problems, *counts in finished:
+            _put(reply, int(piece.rows[place]), found, problems)
+        if row not in places:  # else it ended the process when it had its answer
+            places.append(row)
+            _put(reply, int(piece.rows[row]), worker.FAILED, [problem])
+            counts = counts[0] + self.spec.episodic, counts[1]
+        if len(left := np.delete(piece.rows, places)):
+            piece.queue.appendleft(left)
+        return _add(reply, *counts, time.monotonic() - piece.given)
 
     def _pieces(self, lanes):
         """A queue of row numbers for each worker; that of episodes is one for all."""
@@ -272,7 +298,7 @@ class Pool:
         try:
             for w, task in starting:
                 task.result(timeout=START)
-                w.configure(self.x, self.size, self.spec.limit)
+                w.configure(self.x, self.size)
         except Exception as error:
             _close(self.workers)
             raise Unloadable(
@@ -284,8 +310,21 @@ def _merge(all, rows, part):
     for name in ("event", "distance", "terminal", "log_p", "seen"):
         getattr(all, name)[rows] = getattr(part, name)
     all.problems.extend((int(rows[i]), kind, message) for i, kind, message in part.problems)
-    counts = "episodes", "transitions", "seconds"
-    return all._replace(**{name: getattr(all, name) + getattr(part, name) for name in counts})
+    return _add(all, part.episodes, part.transitions, part.seconds)
+
+
+def _put(reply, row, found, problems):
+    for array, value in zip(reply, found):
+        array[row] = value
+    reply.problems.extend((row, *problem) for problem in problems)
+
+
+def _add(reply, episodes, transitions, seconds):
+    return reply._replace(
+        episodes=reply.episodes + episodes,
+        transitions=reply.transitions + transitions,
+        seconds=reply.seconds + seconds,
+    )
 
 
 def _cause(error):

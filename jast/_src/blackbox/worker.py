@@ -8,6 +8,7 @@ NumPy and the standard library only.
 import contextlib
 import inspect
 import os
+import pickle
 import signal
 import sys
 import threading
@@ -21,6 +22,8 @@ import numpy as np
 
 __all__ = [
     "METHODS",
+    "FAILED",
+    "HEAD",
     "NAME",
     "Reply",
     "Runner",
@@ -124,6 +127,9 @@ def takes(function, count):
     return True
 
 
+HEAD = 16  # bytes of a worker's file before its finished rows: when what runs began, and its row
+END = pickle.dumps(None)  # behind these rows
+FAILED = (False, np.nan, True, 0.0, 0.0)  # event, distance, terminal, log p and what is seen
 MAKING = 60.0  # seconds that the making of an object may take, whatever the time limit of its runs
 
 
@@ -137,7 +143,7 @@ class Runner:
         self.count = 0  # of these
         self.spare: deque = deque()  # objects for new episodes, the longest unused first
         self.episodes = self.transitions = 0
-        self.alarm = Alarm(spec.limit)
+        self.alarm, self.finished = Alarm(spec.limit), None
         self.configure(x, size)
 
     def __reduce__(self):  # another process makes objects of its own
@@ -145,11 +151,13 @@ class Runner:
 
     def configure(self, x, size, at=None):
         """``x``: the structure of a disturbance, like ``x0`` of `Spec`; ``size``: how many numbers
-        ``observe`` returns; ``at``: a file that is told where the work is, if anybody waits.
+        ``observe`` returns; ``at``: a file that is told where the work is, and what each row came
+        to, if anybody waits.
         """
         self.x, self.size = x, size
         if at is not None:
-            self.alarm.at = np.memmap(at, np.float64, "r+")
+            self.alarm.at = np.memmap(at, np.float64, "r+", shape=2)
+            self.finished = open(at, "r+b", buffering=0)  # what is written outlives this process
 
     def probe(self, x0):
         """How many numbers ``observe`` returns, or a sentence (str) that says what is wrong with
@@ -189,21 +197,33 @@ class Runner:
         begin = time.perf_counter()
         self.episodes = self.transitions = 0
         one = self._episode if self.spec.episodic else self._step
+        if self.finished is not None:
+            self.finished.seek(HEAD)
+            self._keep(END)
         for i in range(len(t)):
-            self.alarm.row = i
+            self.alarm.row, problem = i, []
             try:
                 found = one(
                     int(t[i]), [np.array(a[i]) for a in x0], [np.array(a[i, : t[i]]) for a in xs]
                 )
-                for array, value in zip(outcomes, found):
-                    array[i] = value
             except KeyboardInterrupt:
                 raise
             except BaseException as error:  # SystemExit too: the system's, not ours
-                outcomes[2][i] = True  # terminal
-                problems.append((i, *said(error)))
+                found, problem = FAILED, [said(error)]
+            for array, value in zip(outcomes, found):
+                array[i] = value
+            problems += [(i, *words) for words in problem]
+            if self.finished is not None:
+                row = i, found, problem, self.episodes, self.transitions
+                self._keep(pickle.dumps(row) + END)
         seconds = time.perf_counter() - begin
         return Reply(*outcomes, problems, self.episodes, self.transitions, seconds)
+
+    def _keep(self, written):
+        """Write to the file of finished rows; what comes next stands in the place of its end."""
+        with contextlib.suppress(OSError):  # a full disk costs no more than these
+            self.finished.write(written)
+            self.finished.seek(-len(END), os.SEEK_CUR)
 
     def judge(self, x0, xs):
         """[n, 2] bool of whole episodes of objects: whether ``is_event`` holds at a state before
