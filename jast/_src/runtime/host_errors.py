@@ -5,6 +5,7 @@ raised, so that a search goes on.
 from __future__ import annotations
 
 import contextlib
+import re
 import threading
 from collections.abc import Iterator
 from typing import Any, NamedTuple
@@ -32,6 +33,7 @@ __all__ = [
     "telling_runs",
 ]
 
+NUMBERS = re.compile(r"-?\d+\.\d+(e[-+]?\d+)?|-?\d+e[-+]?\d+")  # those that are not whole
 GROUPS = 100  # different messages that a `Log` keeps apart at most: each has an example
 KINDS = {
     "raised": "run the system on the example's disturbances to see it again",
@@ -94,8 +96,17 @@ class Incident(NamedTuple):
         return f"{self.count} x {said}; {KINDS[self.kind]}"
 
 
+def _group(kind: str, message: str) -> tuple[str, str]:
+    """What incidents have in common that are counted as one: wrong answers whatever was received,
+    and messages that differ in numbers with a fraction.
+    """
+    if kind == "wrong answer":
+        return kind, message.partition(", received ")[0]
+    return kind, NUMBERS.sub("#", message)
+
+
 class Log:
-    """Counts incidents by kind and message; may be shared by threads."""
+    """Counts incidents by kind and message (`_group`); may be shared by threads."""
 
     def __init__(self):
         self._groups, self._lock = {}, threading.Lock()
@@ -105,12 +116,12 @@ class Log:
         only.
         """
         with self._lock:
-            group = kind, message
+            group = _group(kind, message)
             if group not in self._groups and len(self._groups) >= GROUPS:
                 latest = f"more than {GROUPS} different messages; the latest: {kind}: {message}"
-                other = "other", latest[:200]
-                group = next((g for g in self._groups if g[0] == "other"), other)
-            incident = self._groups.get(group) or Incident(*group, 0, *example())
+                kind, message = "other", latest[:200]
+                group = "other", ""
+            incident = self._groups.get(group) or Incident(kind, message, 0, *example())
             self._groups[group] = incident._replace(count=incident.count + 1)
 
     def all(self):
@@ -209,8 +220,9 @@ def merge_incidents(first, second):
     """All incidents as one tuple, in which those of one kind and message are counted together."""
     groups = {}
     for i in (*first, *second):
-        known = groups.setdefault((i.kind, i.message), i._replace(count=0))
-        groups[i.kind, i.message] = known._replace(count=known.count + i.count)
+        group = _group(i.kind, i.message)
+        known = groups.setdefault(group, i._replace(count=0))
+        groups[group] = known._replace(count=known.count + i.count)
     return tuple(groups.values())
 
 

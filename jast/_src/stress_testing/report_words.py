@@ -177,10 +177,11 @@ def verdict_rows(r: Any) -> list[tuple[str, str]]:
         elif np.isfinite(r.late):
             text += f"; its refinement last gained {r.late:.1e}"
     rows.append(("likeliest", text))
-    if r.invalid:
+    # of a black box: their disturbances are in jast.incidents.incidents
+    wrong = () if r.sim is None else incidents(r.sim)
+    if r.invalid and not wrong:  # which count runs; here are those answered from memory, too
         rows.append(("invalid", f"{r.invalid} episodes gave numbers that are not finite"))
-    if r.sim is not None:  # of a black box: their disturbances are in jast.incidents.incidents
-        rows += [("went wrong", str(incident)) for incident in incidents(r.sim)[:SHOWN_INCIDENTS]]
+    rows += [("went wrong", str(incident)) for incident in wrong[:SHOWN_INCIDENTS]]
     if "interrupted" in r.settings:
         rows.append(("interrupted", r.settings["interrupted"]))
     return rows
