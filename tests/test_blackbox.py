@@ -155,6 +155,70 @@ def test_check_says_where_an_object_does_not_start_anew(episodic):
     assert jast.check(box(blackboxes.Walk, 5, episodic=episodic))
 
 
+class Windy(blackboxes.Walk):
+    """The wind of the last step of an episode blows in the next one."""
+
+    wind = 0.0
+
+    def transition(self, x):
+        super().transition(x + self.wind)
+        self.wind = 0.1 * float(x)
+
+    def miss_distance(self):
+        return 4.0 - self.s
+
+
+class Shared(Windy):
+    """Has its wind in common with all others."""
+
+    winds = [0.0]
+
+    def transition(self, x):
+        super(Windy, self).transition(x + self.winds[0])
+        self.winds[0] += 0.01
+
+
+@pytest.mark.parametrize("episodic", [None, True])
+def test_check_says_what_carries_over_into_the_next_episode(episodic):
+    sim, step = box(Windy, 5, episodic=episodic), 5 if episodic else 1
+    words = f"initialize: does not reset everything: at step {step} distance is .*, and .* where"
+    with pytest.raises(ValueError, match=words):
+        jast.check(sim)
+    assert blackbox.calls(sim).episodes == 9 + 4
+    with pytest.raises(ValueError, match=f"^not deterministic: at step {step} distance is"):
+        jast.check(box(Shared, 5, episodic=episodic))
+    sound = box(Raises, 5, episodic=episodic)
+    with pytest.raises(ValueError, match="KeyError"):  # what raises is not compared
+        jast.check(sound)
+
+
+class Constant(blackboxes.Walk):
+    def miss_distance(self):
+        return 1.0
+
+
+class Reversed(blackboxes.Walk):
+    def is_event(self):
+        return self.s > 1.0
+
+    def miss_distance(self):
+        return self.s - 1.0
+
+
+@pytest.mark.parametrize(
+    "of, constant, reverse",
+    [
+        ("states", Constant, Reversed),
+        ("episodes", lambda x: (False, 1.0), lambda x: (x.sum() > 1.0, x.sum() - 1.0)),
+    ],
+)
+def test_check_says_what_is_wrong_with_the_distances(of, constant, reverse):
+    with pytest.warns(UserWarning, match=f"check: the miss distance is 1 in all [0-9]* {of} "):
+        jast.check(box(constant, 5))
+    with pytest.warns(UserWarning, match=f"{of} that fail is greater than .* sign wrong"):
+        jast.check(box(reverse, 5))
+
+
 class Raises(blackboxes.Walk):
     def transition(self, x):
         raise KeyError("a")
@@ -169,7 +233,13 @@ class Mute(blackboxes.Walk):
 
 @pytest.mark.parametrize(
     "system, words",
-    [(Mute, "init: .*at the start, .*\n.*received None"), (Raises, "step: .*\n.*KeyError: 'a'")],
+    [
+        (Mute, "init: 1 x .*received None.*\n  so state leaf .distance is NaN at the start, .*"),
+        (
+            Raises,
+            "step: 9 x raised KeyError: 'a' .*\n  so state leaf .distance is NaN after 1 steps",
+        ),
+    ],
 )
 def test_check_says_what_an_object_raised(system, words):
     with pytest.raises(ValueError, match=words):
@@ -289,7 +359,23 @@ def test_another_outcome_of_the_same_disturbances_is_seen(key):
             jast.check(box(blackboxes.Forgetful, 3, episodic=episodic))
 
 
+@pytest.mark.parametrize("answer", [str, lambda x: None, lambda x: np.array([x, x])])
+def test_wrong_answers_are_one_whatever_they_are(answer):
+    sim = box(lambda x: (False, answer(x[0])))
+    with pytest.raises(ValueError, match="evaluate: 9 x wrong answer: distance must be one number"):
+        jast.check(sim)
+    assert [i.count for i in incidents(sim)] == [9]
+
+
 def test_the_log_groups_and_is_bounded():
+    log = Log()
+    for kind, message in [
+        ("raised", "raised E: at 0.25 of 3"),
+        ("raised", "raised E: at -1.5e-07 of 3"),
+        ("raised", "raised E: at 0.25 of 4"),
+    ]:
+        log.add(kind, message, lambda: ((), 0))
+    assert [i.count for i in log.all()] == [2, 1]
     log = Log()
     for i in range(GROUPS + 20):
         log.add("raised", f"raised {i}", lambda i=i: ((), i))

@@ -167,6 +167,15 @@ def test_workers_have_neither_jax_nor_this_package_and_share_the_rows():
     assert scale and incidents(sim) == ()
 
 
+class Windy(blackboxes.Leaves):
+    def transition(self, x):
+        super().transition(x + vars(self).get("wind", 0.0))
+        self.wind = 0.1 * float(x)
+
+    def miss_distance(self):
+        return 4.0 - abs(self.s)
+
+
 class Hangs(blackboxes.Leaves):
     def is_event(self):
         if self.s != 0:
@@ -185,6 +194,9 @@ def test_check_looks_on_the_way_in_a_worker():
             jast.check(box(blackboxes.Leaves, **each))
         said.append([str(w.message) for w in warned])
     assert said[0] == said[1]
+    carries = box(Windy, **settings)
+    with pytest.raises(ValueError, match="initialize: does not reset everything: at step 8"):
+        jast.check(carries)
     # what gives no answer is not compared
     host = next(hosts_of(box(Hangs, **settings)))
     assert host.lost([], [np.ones((2, 8))]) == 0
@@ -309,3 +321,5 @@ def test_a_system_that_no_worker_can_load_ends_the_search(tmp_path, monkeypatch)
     (tmp_path / "only_here.py").write_text("raise OSError('no licence')\n")
     with pytest.raises(RuntimeError, match="could not load the system: OSError: no licence"):
         ends(sim, [0.0])
+    with pytest.raises(ValueError, match="^check: .* could not load the system: OSError: no lic"):
+        jast.check(sim)  # in the first line

@@ -166,12 +166,20 @@ class Host:
         """How many episodes of objects fail on the way and no longer at the end; ``x0``, ``xs``:
         leaves [n, ...] and [n, horizon, ...].
         """
-        rows = [[np.asarray(a) for a in leaves] for leaves in (x0, xs)]
         with self.lock:
-            on_the_way, at_the_end = self.runner.judge(*rows).T
+            on_the_way, at_the_end = self.runner.judge(*map(_arrays, (x0, xs))).T
             n = len(on_the_way)
             self.count(episodes=n, transitions=n * self.spec.horizon)
         return int(np.sum(on_the_way & ~at_the_end))
+
+    def again(self, x0, xs):
+        """What objects say on the way as `worker.Runner.again` has it; ``x0``, ``xs``: leaves
+        [2, ...] and [2, horizon, ...].
+        """
+        with self.lock:
+            found, episodes, transitions = self.runner.again(*map(_arrays, (x0, xs)))
+            self.count(episodes=episodes, transitions=transitions)
+        return found
 
     def _answer(self, lanes, t, x0, xs, dtype):
         """Outcomes of rows: of those that were not answered before, and of a few others
@@ -268,6 +276,10 @@ class Host:
                 self.differs = True
                 self.log.add("not deterministic", f"the same disturbances gave {what}", example)
                 return
+
+
+def _arrays(leaves):
+    return [np.asarray(a) for a in leaves]
 
 
 def _problems(reply, dtype):

@@ -57,7 +57,9 @@ class _Install:
         return worker.install, self.parts
 
 
-SERVE, PROBE, CONFIGURE, JUDGE = map(_Remote, ("serve", "probe", "configure", "judge"))
+SERVE, PROBE, CONFIGURE, JUDGE, AGAIN = map(
+    _Remote, ("serve", "probe", "configure", "judge", "again")
+)
 
 
 def pack(system, spec):
@@ -148,8 +150,8 @@ class Pool:
     """A `worker.Runner` whose rows are shared out over processes.
 
     Episodes go in pieces to whoever is free; the rows of a system of kept objects stay with their
-    worker. A worker that dies is replaced, and the row that ran is the culprit. So is one of which a
-    part runs for longer than the time limit and `GRACE`; it costs these and a start of a process.
+    worker. A worker that dies is replaced, and the row that ran is the culprit. So is one of which
+    a part runs for longer than the time limit and `GRACE`; it costs these and a start of a process.
     What the worker had answered by then is kept, and the rest of its piece runs in another one.
     """
 
@@ -188,12 +190,22 @@ class Pool:
         """
         n = len(xs[0])
         limit = None if self.spec.limit is None else n * self.spec.limit + GRACE
+        found = self._first(limit, JUDGE, x0, xs)
+        return np.zeros((n, 2), bool) if found is None else found
+
+    def again(self, x0, xs):
+        """As `worker.Runner.again`, in the first worker."""
+        parts = 4 * (2 * self.spec.horizon + 1)
+        limit = None if self.spec.limit is None else parts * self.spec.limit + START
+        return self._first(limit, AGAIN, x0, xs) or (None, 0, 0)
+
+    def _first(self, limit, task, *args):
+        """What the first worker answers within ``limit`` seconds; None where it does not."""
         self._start(self.workers[:1])
         try:
-            return self.workers[0].executor.submit(JUDGE, x0, xs).result(timeout=limit)
+            return self.workers[0].executor.submit(task, *args).result(timeout=limit)
         except Exception:
             self.workers[0].kill()
-            return np.zeros((n, 2), bool)
 
     def __call__(self, t, x0, xs, lanes):
         """As `worker.Runner`: the `worker.Reply` for n rows; ``lanes`` [n]: their places in the
@@ -262,9 +274,10 @@ class Pool:
         if 0 < piece.worker.unbegun < TRIES:  # it died while it had nothing to do
             piece.queue.appendleft(piece.rows)
             return reply
-        places, row, counts = [f[0] for f in finished], row or 0, (0, 0)
-        for place, found, problems, *counts in finished:
+        places, row = [f[0] for f in finished], row or 0
+        for place, found, problems, *_ in finished:
             _put(reply, int(piece.rows[place]), found, problems)
+        counts = finished[-1][-2:] if finished else (0, 0)
         if row not in places:  # else it ended the process when it had its answer
             places.append(row)
             _put(reply, int(piece.rows[row]), worker.FAILED, [problem])

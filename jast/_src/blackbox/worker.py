@@ -249,6 +249,45 @@ class Runner:
             self.spare.append(thing)
         return found
 
+    def again(self, x0, xs):
+        """What an object says on the way (`_trace`) in the first of two episodes, in the second,
+        and in the first again; where that is not the same, what a new object says in it, too. None
+        where something goes wrong. Then how many episodes and transitions that took.
+        """
+        self.episodes = self.transitions = 0
+        first, second = ([[np.array(a[i]) for a in leaves] for leaves in (x0, xs)] for i in (0, 1))
+        try:
+            thing, found = self._new(), []
+            for given in (first, second, first):
+                found.append(self._trace(thing, *given))
+            if found[0] != found[2]:
+                found.append(self._trace(self._new(), *first))
+        except KeyboardInterrupt:
+            raise
+        except BaseException:
+            found = None
+        return found, self.episodes, self.transitions
+
+    def _trace(self, thing, x0, xs):
+        """Event, distance, terminal, log p and observation of an object at every state of an
+        episode; at the last where it is judged there.
+        """
+        self.episodes += 1
+        if self.spec.episodic:
+            return [self._play(thing, self.spec.horizon, x0, xs)]
+        found, log_p, answer = [], 0.0, None
+        for k in range(self.spec.horizon + 1):
+            if k:
+                log_p, answer = self._move(thing, fill(self.x, [a[k - 1] for a in xs]))
+            else:
+                with self.alarm:
+                    answer = self._initialize(thing, x0)
+            *said, seen = self._look(thing, log_p, answer)
+            found.append((*said, np.asarray(seen, float).tobytes()))
+            if said[0] or said[2]:
+                break
+        return found
+
     def _episode(self, t, x0, xs):
         self.episodes += 1
         if self.spec.run:
@@ -262,13 +301,20 @@ class Runner:
             log_p = self._log_p(answer[0], "p") if told else 0.0
             return _event(answer[-2]), _distance(answer[-1]), False, log_p, ()
         thing = self._fresh()
+        found = self._play(thing, t, x0, xs)
+        self.spare.append(thing)
+        return found
+
+    def _play(self, thing, t, x0, xs):
+        """Event, distance, terminal, log p and observation of an object at the end of an episode
+        that is judged there.
+        """
         with self.alarm:
             thing.initialize(*self._given(x0))
             log_p = 0.0
             for k in range(t):
                 log_p += self._transition(thing, fill(self.x, [a[k] for a in xs]))
             log_p, *outcome = self._outcome(thing, log_p, _evaluate(thing))
-        self.spare.append(thing)
         return *outcome, False, log_p, ()
 
     def _step(self, t, x0, xs):
@@ -344,8 +390,9 @@ class Runner:
         return (fill(self.spec.x0, x0),) if self.spec.random else ()
 
     def _fresh(self):
-        if self.spare:
-            return self.spare.popleft()
+        return self.spare.popleft() if self.spare else self._new()
+
+    def _new(self):
         self.alarm.tell(MAKING)
         return self.system()
 
@@ -485,7 +532,8 @@ def install(system, spec):
     module.runner = runner = Runner(system, spec)
     # a plain tuple: the class would travel with it
     module.serve = lambda *rows: tuple(runner(*rows))
-    module.probe, module.configure, module.judge = runner.probe, runner.configure, runner.judge
+    for name in ("probe", "configure", "judge", "again"):
+        setattr(module, name, getattr(runner, name))
     sys.modules[NAME] = module
 
 

@@ -21,6 +21,7 @@ from jax import lax
 
 from jast import distributions as D
 from jast._src.core.actions import Quantiles, Samples, UniformBox, Wide
+from jast._src.core.black_boxes import check_played_again, words_on_distances
 from jast._src.core.lost_failures import warn_of_lost_failures
 from jast._src.core.probe import probe
 from jast._src.core.simulator import Simulator, first_state, require_simulator
@@ -35,7 +36,6 @@ __all__ = ["ACTIONS", "OBSERVED", "check", "contract"]
 OBSERVED = 64  # numbers that ``observe`` may return at most to what looks at them, as networks do
 ARRAYS = (jax.Array, np.ndarray, np.generic, bool, int, float)
 LOOKS = {"disturbance", "evaluate", "is_terminal", "observe"}  # at a state that goes on
-ANEW = ", and initialize brings an object back to its start, whatever it did before"
 DRAWS = 64  # of the actions at the start
 HINTS = {
     "TracerBoolConversionError": (
@@ -62,11 +62,13 @@ ACTIONS = {
 def check(sim: Simulator, actions: Actions | None = None) -> Simulator:
     """Whether a simulator keeps its contract: every function is traced and a few steps are run.
 
-    Runs 81 episodes, of at most 500 steps where the system is not episodic (9 of a system on the
-    host, and one twice). Where ``sim`` holds tracers, or inside a transformation of JAX, only the
-    traced half runs. Warns (UserWarning) where objects of `jast.blackbox` that are judged at the
-    end only (``episodic=True``) failed on the way in some of 16 more episodes, and of what fits
-    together and loses failures all the same (not of a system on the host):
+    Runs 81 episodes, of at most 500 steps where the system is not episodic. Of a system on the host
+    it runs 9, and one twice; of objects of `jast.blackbox` also two whole episodes, and then the
+    first of them again. Where ``sim`` holds tracers, or inside a transformation of JAX, only the
+    traced half runs. Warns (UserWarning) where such objects that are judged at the end only
+    (``episodic=True``) failed on the way in some of 16 more episodes; where the miss distances of a
+    system on the host are all equal, or greater where it fails; and of what fits together and loses
+    failures all the same (not of a system on the host):
 
      - the floats of the state are too coarse for what a disturbance does to it, or no disturbance
        changes a number of the state;
@@ -104,19 +106,22 @@ def check(sim: Simulator, actions: Actions | None = None) -> Simulator:
         found = probe(sim)
     except jax.errors.JaxRuntimeError as e:  # a host callback that raised
         raise ValueError(
-            f"check: while the first steps ran, a function of the simulator raised {_first_line(e)}"
+            f"check: while the first steps ran, a function of the simulator raised {_raised(e)}"
         ) from e
     _check_densities(found)
-    _check_numbers(found, new_incidents(before, incidents(sim)))
+    check_played_again(sim, found.x0)
     _check_twice("init", sim.init, found.x0)
     _check_twice("evaluate", sim.evaluate, found.judged)
     for incident in new_incidents(before, incidents(sim)):
         if incident.kind == "not deterministic":
             raise ValueError(
-                f"evaluate: {incident.message}: randomness belongs in disturbance or start{ANEW}"
+                f"evaluate: not deterministic: {incident.message}: randomness belongs in"
+                " disturbance or start, and nothing is kept from run to run"
             )
     _check_twice("step", lambda x0, x: sim.step(first_state(sim, x0), x), found.x0, found.x)
-    for words in [] if runs_on_host(sim) else traps(sim, found.resolution):
+    _check_numbers(found, new_incidents(before, incidents(sim)))
+    hosted = runs_on_host(sim)
+    for words in words_on_distances(sim) if hosted else traps(sim, found.resolution):
         warnings.warn(f"check: {words}", UserWarning, stacklevel=2)
     warn_of_lost_failures(sim)
     share = 0.0 if actions is None else _impossible_share(sim, actions, found.x0)
@@ -352,12 +357,18 @@ def _check_numbers(found, went_wrong):
     leaves = jax.tree_util.tree_leaves_with_path(found.state)
     steps = [(first_wrong(flags), path) for path, flags in leaves]
     for t, path in sorted([s for s in steps if s[0] is not None], key=lambda s: s[0])[:1]:
-        said = f"{'step' if t else 'init'}: state leaf {_path(path)} is NaN"
-        said += f" {f'after {t} steps' if t else 'at the start'}, expected a number"
-        raise ValueError("\n  ".join([said, *map(str, went_wrong)]))
+        when = f"after {t} steps" if t else "at the start"
+        words = f"state leaf {_path(path)} is NaN {when}, expected a number"
+        raise ValueError(_because(went_wrong, "step" if t else "init", words))
     if (t := first_wrong(found.distance)) is not None:
-        said = f"evaluate: distance is not finite after {t} steps, expected a number"
-        raise ValueError("\n  ".join([said, *map(str, went_wrong)]))
+        words = f"distance is not finite after {t} steps, expected a number"
+        raise ValueError(_because(went_wrong, "evaluate", words))
+
+
+def _because(incidents, name, words):
+    """``words`` on the function of that ``name``, after the ``incidents`` that led to it."""
+    causes = list(map(str, incidents))
+    return f"{name}: " + "\n  ".join([*causes, "so " * bool(causes) + words])
 
 
 def _check_twice(name, function, *args):
@@ -375,8 +386,8 @@ def _check_twice(name, function, *args):
     ):
         if np.asarray(a).tobytes() != np.asarray(b).tobytes():
             raise ValueError(
-                f"{name}: leaf {_path(path)} differs between two runs on the same input;"
-                f" randomness belongs in disturbance or start{ANEW if hosted else ''}"
+                f"{name}: {'not deterministic: ' if hosted else ''}leaf {_path(path)} differs"
+                " between two runs on the same input; randomness belongs in disturbance or start"
             )
 
 
@@ -388,6 +399,12 @@ def _text(name, function, args):
 
 def _name(actions):
     return ACTIONS.get(type(actions), f"actions.{type(actions).__name__}")
+
+
+def _raised(error):
+    """What a callback raised: JAX shows it behind the traceback."""
+    lines = str(error).strip().split("\n  ")[-1].splitlines()
+    return (lines[1:] or lines)[0]
 
 
 def _first_line(error):

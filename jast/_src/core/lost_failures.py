@@ -13,7 +13,7 @@ from jast._src.core.simulator import Simulator, first_state, next_state
 from jast._src.runtime.host_errors import hosts_of
 from jast._src.util.pytrees import select
 
-__all__ = ["warn_of_lost_failures"]
+__all__ = ["EPISODES", "warn_of_lost_failures"]
 
 EPISODES = 16  # half of them drawn from the model, half from its tails, where failures are
 TAIL = 0.02  # the probability of both tails together

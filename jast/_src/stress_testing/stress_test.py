@@ -9,6 +9,7 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
+from jast._src.core.black_boxes import runs_for_objects
 from jast._src.core.episode import Episode, rollout, stacked
 from jast._src.core.failures import Failures, collect, empty, merge, rank
 from jast._src.core.nominal import BRIEF, nominal
@@ -76,8 +77,9 @@ the crossing, the cart-pole and the ship failures are as likely with half as man
 coolings, which cost a tenth of the CPU time."""
 POOL_FACTOR = 32  # failures in the pool for each that is returned: modes are told apart among these
 HOSTED_EXTRA = 14
-"""Runs of a black box that no other piece of the work counts: of `check` 10, the undisturbed
-episode and its proof, and two that are made again to see whether they are answered the same."""
+"""Runs of a black box that no other piece of the work counts: of `check` 10, and those for objects,
+the undisturbed episode and its proof, and two that are made again to see whether they are answered
+the same."""
 LAST_SHARE = 0.15  # of the budget, what a black box keeps for the probability, whatever came before
 FALSIFY_SHARE = 0.2
 """Share of a black box's search that looks for a first failure, at most, where several explorers
@@ -142,7 +144,7 @@ class StressTest:
         # evaluations that a black box, which must not run once too often, keeps for its estimate
         self.last = int(LAST_SHARE * budget) if self.hosted else 0
         if self.hosted:
-            self.note("check", HOSTED_EXTRA)
+            self.note("check", HOSTED_EXTRA + runs_for_objects(sim))
 
     def next_key(self):
         self.key, key = jax.random.split(self.key)
