@@ -178,6 +178,16 @@ class Shared(Windy):
         self.winds[0] += 0.01
 
 
+class Worn(Windy):
+    """Wears out after so many steps."""
+
+    steps = 0
+
+    def transition(self, x):
+        self.steps += 1
+        super(Windy, self).transition(x * (1 if self.steps < 40 else 2))
+
+
 @pytest.mark.parametrize("episodic", [None, True])
 def test_check_says_what_carries_over_into_the_next_episode(episodic):
     sim, step = box(Windy, 5, episodic=episodic), 5 if episodic else 1
@@ -187,9 +197,13 @@ def test_check_says_what_carries_over_into_the_next_episode(episodic):
     assert blackbox.calls(sim).episodes == 9 + 4
     with pytest.raises(ValueError, match=f"^not deterministic: at step {step} distance is"):
         jast.check(box(Shared, 5, episodic=episodic))
-    sound = box(Raises, 5, episodic=episodic)
     with pytest.raises(ValueError, match="KeyError"):  # what raises is not compared
-        jast.check(sound)
+        jast.check(box(Raises, 5, episodic=episodic))
+
+
+def test_check_sees_what_only_many_episodes_show():
+    with pytest.raises(ValueError, match="initialize: does not reset everything: at step 5"):
+        jast.check(box(Worn, 5, episodic=True))
 
 
 class Constant(blackboxes.Walk):

@@ -250,16 +250,18 @@ class Runner:
         return found
 
     def again(self, x0, xs):
-        """What an object says on the way (`_trace`) in the first of two episodes, in the second,
-        and in the first again; where that is not the same, what a new object says in it, too. None
-        where something goes wrong. Then how many episodes and transitions that took.
+        """What a new object says on the way (`_trace`) in the first of two episodes; one that has
+        played others in the second, and in the first again; and where that is not the same, another
+        new one. None where something goes wrong. Then how many episodes and transitions that took.
         """
         self.episodes = self.transitions = 0
         first, second = ([[np.array(a[i]) for a in leaves] for leaves in (x0, xs)] for i in (0, 1))
         try:
-            thing, found = self._new(), []
-            for given in (first, second, first):
-                found.append(self._trace(thing, *given))
+            thing = self._new()
+            found = [self._trace(thing, *first)]
+            thing = self.spare.pop() if self.spare else thing  # the more it has done the better
+            found += [self._trace(thing, *given) for given in (second, first)]
+            self.spare.append(thing)
             if found[0] != found[2]:
                 found.append(self._trace(self._new(), *first))
         except KeyboardInterrupt:

@@ -36,6 +36,7 @@ __all__ = ["ACTIONS", "OBSERVED", "check", "contract"]
 OBSERVED = 64  # numbers that ``observe`` may return at most to what looks at them, as networks do
 ARRAYS = (jax.Array, np.ndarray, np.generic, bool, int, float)
 LOOKS = {"disturbance", "evaluate", "is_terminal", "observe"}  # at a state that goes on
+ANEW = ", and initialize brings an object back to its start, whatever it did before"
 DRAWS = 64  # of the actions at the start
 HINTS = {
     "TracerBoolConversionError": (
@@ -116,7 +117,7 @@ def check(sim: Simulator, actions: Actions | None = None) -> Simulator:
         if incident.kind == "not deterministic":
             raise ValueError(
                 f"evaluate: not deterministic: {incident.message}: randomness belongs in"
-                " disturbance or start, and nothing is kept from run to run"
+                f" disturbance or start{ANEW}"
             )
     _check_twice("step", lambda x0, x: sim.step(first_state(sim, x0), x), found.x0, found.x)
     _check_numbers(found, new_incidents(before, incidents(sim)))
@@ -388,6 +389,7 @@ def _check_twice(name, function, *args):
             raise ValueError(
                 f"{name}: {'not deterministic: ' if hosted else ''}leaf {_path(path)} differs"
                 " between two runs on the same input; randomness belongs in disturbance or start"
+                f"{ANEW if hosted else ''}"
             )
 
 
