@@ -412,7 +412,7 @@ def pages_used(candidates, widening, exploration, gain):
     for turn in range(2):
         tree = run._grow(p, tree, turn * 60, (turn + 1) * 60, "node")
         tree, _ = run._prune(p, tree, ROOM + 1, "node")
-    return np.asarray(tree.pages), T.pages_of(p, ROOM), T._pages(ROOM)
+    return np.asarray(tree.pages), T.pages_of(p, ROOM), T.pages_of(p._replace(guide=()), ROOM)
 
 
 @pytest.mark.slow

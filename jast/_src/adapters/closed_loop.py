@@ -23,6 +23,7 @@ from jast._src.adapters.state_arrays import as_numbers, free_to_move, in_dtypes_
 from jast._src.core.check import OBSERVED
 from jast._src.core.simulator import Simulator, fixed, ravel
 from jast._src.core.typing import Array, DistributionLike
+from jast._src.util.checks import wrong
 from jast._src.util.pytrees import as_partial
 
 __all__ = ["Change", "Instant", "Judgement", "Noise", "Outcome", "check_environment", "simulator"]
@@ -133,10 +134,8 @@ def simulator(
             + ("" if seed is None else ', or seed="episode"')
         )
     if not drawn and seed is not None and (type(seed) is not int or not 0 <= seed < 2**32):
-        raise ValueError(
-            f'{name}: seed must be a whole number from 0 to 2**32 - 1, "episode" or "step",'
-            f" received {seed!r}"
-        )
+        must = 'be a whole number from 0 to 2**32 - 1, "episode" or "step"'
+        raise wrong(name, "seed", must, f"{seed!r}")
     number = np.uint32(0 if drawn or seed is None else seed)
     functions = {k: v if v is None else as_partial(v) for k, v in functions.items()}
     loop = _Loop(

@@ -15,7 +15,7 @@ from jast._src.adapters.closed_loop import Instant
 from jast._src.adapters.noise import add
 from jast._src.adapters.state_arrays import refuse_warp
 from jast._src.core.simulator import Simulator
-from jast._src.util.checks import whole_number
+from jast._src.util.checks import whole_number, wrong
 from jast._src.util.pytrees import as_partial
 
 __all__ = ["mjx"]
@@ -142,10 +142,8 @@ def mjx(
             raise ValueError(f"mjx: {name} must be a function, received {value!r}")
     lacking = [name for name in (*_Body._fields, "ctrl", "replace") if not hasattr(data, name)]
     if lacking:
-        raise ValueError(
-            f"mjx: data must be that of mjx.make_data or mjx.put_data, received"
-            f" {type(data).__name__} without {', '.join(lacking)}"
-        )
+        must = "be that of mjx.make_data or mjx.put_data"
+        raise wrong("mjx", "data", must, f"{type(data).__name__} without {', '.join(lacking)}")
     if not (force is None or isinstance(force, tuple)):
         force = force, _push
     physics = _Physics(

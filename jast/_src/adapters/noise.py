@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from jax.tree_util import Partial
 
 from jast import distributions as D
+from jast._src.util.checks import wrong
 from jast._src.util.pytrees import as_partial
 
 __all__ = ["Random", "add", "disturbed", "model_of", "random", "replaced"]
@@ -87,9 +88,7 @@ def replaced(subject: Any, draw: Any) -> Any:
     """``subject`` with the fields that ``draw`` names."""
     for k in draw:
         if not hasattr(subject, k):
-            raise ValueError(
-                f"parameters: names must be fields of {type(subject).__name__}, received {k!r}"
-            )
+            raise wrong("parameters", "names", f"be fields of {type(subject).__name__}", f"{k!r}")
     like = {k: jnp.asarray(getattr(subject, k)) for k in draw}
     return subject.replace(**{k: jnp.asarray(v, like[k].dtype) for k, v in draw.items()})
 

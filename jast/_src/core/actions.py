@@ -16,7 +16,7 @@ from jast import distributions as D
 from jast._src.core.typing import Array, ArrayTree, DistributionLike, Numeric, PRNGKey
 from jast._src.distributions.normal_tails import normal_score
 from jast._src.runtime._jax import is_traced
-from jast._src.util.checks import check_numbers
+from jast._src.util.checks import check_numbers, wrong
 
 __all__ = [
     "Quantiles",
@@ -391,9 +391,8 @@ def _ordered(low, high):
         except (TypeError, ValueError):  # no numbers, or shapes that do not fit: `check` says which
             continue
         if above:
-            raise ValueError(
-                f"actions.uniform: low must not be above high, received low={low!r}, high={high!r}"
-            )
+            must = "not be above high"
+            raise wrong("actions.uniform", "low", must, f"low={low!r}, high={high!r}")
 
 
 def _as(dtype, *values):

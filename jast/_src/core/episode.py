@@ -23,7 +23,7 @@ from jast._src.core.typing import Array, ArrayTree, PRNGKey, Reward
 from jast._src.runtime._jax import is_traced, quick
 from jast._src.runtime.host_errors import runs_on_host
 from jast._src.util import display
-from jast._src.util.checks import check_random_key
+from jast._src.util.checks import check_random_key, wrong
 from jast._src.util.pytrees import conform, pad_rows, select, with_rows_of, zero_where
 
 __all__ = ["Episode", "play_back", "play_chosen", "replay", "rollout", "stacked"]
@@ -172,10 +172,8 @@ def replay(
     """
     require_simulator("replay", sim)
     if hasattr(episode, "failures") or hasattr(episode, "episodes"):
-        raise ValueError(
-            "replay: episode must be one Episode, such as report.failures[0], received"
-            f" {type(episode).__name__}"
-        )
+        must = "be one Episode, such as report.failures[0]"
+        raise wrong("replay", "episode", must, type(episode).__name__)
     disturbances, length = episode, None
     if isinstance(episode, Episode):
         disturbances, x0, length = episode.disturbances, episode.x0, episode.length
@@ -185,10 +183,8 @@ def replay(
     leaves = jax.tree.leaves(disturbances)
     rows = {jnp.shape(leaf)[0] if jnp.ndim(leaf) else -1 for leaf in leaves} or {sim.horizon}
     if len(rows) != 1 or not 0 <= (steps := rows.pop()) <= sim.horizon:
-        raise ValueError(
-            f"replay: disturbances must have between 0 and {sim.horizon} rows (the horizon),"
-            f" received {jax.tree.map(jnp.shape, disturbances)}"
-        )
+        must = f"have between 0 and {sim.horizon} rows (the horizon)"
+        raise wrong("replay", "disturbances", must, jax.tree.map(jnp.shape, disturbances))
     rows = jax.tree.map(lambda s: jax.ShapeDtypeStruct((steps, *s.shape), s.dtype), like.x)
     disturbances = conform("replay: disturbances", disturbances, rows)
     steps = jnp.asarray(steps if length is None else length, jnp.int32)

@@ -24,6 +24,7 @@ from jast._src.io import save_load
 from jast._src.io.data_frames import dataframe
 from jast._src.io.export import by_step, from_json, to_csv, to_numpy
 from jast._src.util import display
+from jast._src.util.checks import instance, wrong
 from jast._src.util.pytrees import index_tree
 
 __all__ = [
@@ -232,17 +233,12 @@ def collect(
         >>> len(found), int(found.seen) == int(many.failure.sum())
         (3, True)
     """
-    if not isinstance(episodes, Episode):
-        raise ValueError(
-            f"collect: episodes must be a batch of jast.Episode, received {type(episodes).__name__}"
-        )
+    instance("collect", "episodes", episodes, Episode, "a batch of jast.Episode")
     episodes = jax.device_get(episodes._replace(states=None))
     m = np.shape(episodes.length)[0] if np.ndim(episodes.length) == 1 else None
     if m is None or any(np.shape(leaf)[:1] != (m,) for leaf in jax.tree.leaves(episodes)):
-        raise ValueError(
-            "collect: episodes must share one leading axis, received the shapes"
-            f" {jax.tree.map(np.shape, episodes)}"
-        )
+        must = "share one leading axis"
+        raise wrong("collect", "episodes", must, f"the shapes {jax.tree.map(np.shape, episodes)}")
     tree = _numbers("tree", np.zeros(m, np.int32) if tree is None else tree, m)
     simulation = _numbers("simulation", np.arange(m) if simulation is None else simulation, m)
 
@@ -294,11 +290,7 @@ def merge(a: Failures, b: Failures, top: int = 64) -> Failures:
         True
     """
     for name, given in (("a", a), ("b", b)):
-        if not isinstance(given, Failures):
-            raise ValueError(
-                f"merge: {name} must be an archive of jast.failures, as report.failures, received"
-                f" {type(given).__name__}"
-            )
+        instance("merge", name, given, Failures, "an archive of jast.failures, as report.failures")
     trees = [jax.tree.structure(f.episodes) for f in (a, b)]
     shapes = [[np.shape(leaf)[1:] for leaf in jax.tree.leaves(f.episodes)] for f in (a, b)]
     if trees[0] != trees[1] or shapes[0] != shapes[1]:
@@ -365,10 +357,7 @@ def load(path: PathLike, sim: Simulator | None = None) -> tuple[Failures, dict[s
 def _numbers(name, values, m):
     values = np.asarray(values)
     if values.shape != (m,):
-        raise ValueError(
-            f"collect: {name} must have the shape {(m,)}, one number an episode, received"
-            f" {values.shape}"
-        )
+        raise wrong("collect", name, f"have the shape {(m,)}, one number an episode", values.shape)
     return values.astype(np.int32)
 
 

@@ -33,7 +33,7 @@ from jast._src.core.signature import signature_of
 from jast._src.core.simulator import Simulator
 from jast._src.core.typing import Density, Numeric, Reward
 from jast._src.runtime._jax import is_traced
-from jast._src.util.checks import check_numbers
+from jast._src.util.checks import check_numbers, one_of
 
 __all__ = [
     "Episodic",
@@ -232,8 +232,7 @@ def episodic(
         19.0
     """
     check_numbers("rewards.episodic", bonus=bonus)
-    if mode not in ("default", "thesis"):
-        raise ValueError(f'rewards.episodic: mode must be "default" or "thesis", received {mode!r}')
+    one_of("rewards.episodic", "mode", mode, ("default", "thesis"))
     if mode == "thesis":
         warnings.warn(
             "rewards.episodic: eq. 3.2 as printed scores a failure below a miss unless its miss"

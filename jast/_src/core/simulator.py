@@ -14,6 +14,7 @@ from jax.tree_util import Partial
 from jast._src.core.typing import Disturbance, Evaluate, Init, IsTerminal, Observe, Start, Step
 from jast._src.distributions.containers import accepted
 from jast._src.util import display
+from jast._src.util.checks import wrong
 from jast._src.util.pytrees import as_partial, traceable, with_strong_types
 from jast.distributions import Fixed
 
@@ -146,13 +147,9 @@ class Simulator:
         if isinstance(self.horizon, np.integer):
             object.__setattr__(self, "horizon", int(self.horizon))
         if isinstance(self.horizon, bool) or not isinstance(self.horizon, int) or self.horizon < 1:
-            raise ValueError(
-                f"Simulator: horizon must be an int of at least 1, received {self.horizon!r}"
-            )
+            raise wrong("Simulator", "horizon", "be an int of at least 1", f"{self.horizon!r}")
         if not isinstance(self.episodic, bool):
-            raise ValueError(
-                f"Simulator: episodic must be True or False, received {self.episodic!r}"
-            )
+            raise wrong("Simulator", "episodic", "be True or False", f"{self.episodic!r}")
 
 
 # each is traced once, for all programs with the system in them
@@ -181,6 +178,4 @@ def require_simulator(function: str, sim: Any) -> None:
             " jast.blackbox.from_python makes one, of one in JAX that is negative where it fails"
             " jast.simulators.limit_state"
         )
-    raise ValueError(
-        f"{function}: sim must be a jast.Simulator, received {type(sim).__name__}{advice}"
-    )
+    raise wrong(function, "sim", "be a jast.Simulator", f"{type(sim).__name__}{advice}")

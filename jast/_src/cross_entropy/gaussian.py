@@ -16,6 +16,7 @@ from jax.scipy.linalg import solve_triangular
 from jast._src.core.typing import Array, Numeric
 from jast._src.runtime._jax import is_traced
 from jast._src.util import display
+from jast._src.util.checks import wrong
 
 __all__ = [
     "Gaussian",
@@ -98,15 +99,11 @@ def _normal(name, mean, covariance):
         for part, value in (("mean", mean), ("covariance", covariance))
     )
     if m.ndim != 1 or m.size == 0:
-        raise ValueError(
-            f"{name}: mean must be a vector of one or more numbers, received shape {m.shape}"
-        )
+        raise wrong(name, "mean", "be a vector of one or more numbers", f"shape {m.shape}")
     d = m.size
     if c.shape not in ((), (d,), (d, d)):
-        raise ValueError(
-            f"{name}: covariance must be a number, {d} variances or a {d} x {d} matrix, received"
-            f" shape {c.shape}"
-        )
+        must = f"be a number, {d} variances or a {d} x {d} matrix"
+        raise wrong(name, "covariance", must, f"shape {c.shape}")
     if not is_traced(covariance):
         check_covariance(name, c)
     m, c = jnp.asarray(m, dtype), jnp.asarray(c, dtype)
@@ -134,9 +131,7 @@ def finite_array(name, part, value, dtype):
     except (TypeError, ValueError):
         raise ValueError(f"{name}: {part} must be numbers, received {value!r}") from None
     if not np.isfinite(array).all():
-        raise ValueError(
-            f"{name}: {part} must be finite in {np.dtype(dtype).name}, received {value}"
-        )
+        raise wrong(name, part, f"be finite in {np.dtype(dtype).name}", value)
     return array
 
 

@@ -19,7 +19,7 @@ from jast._src.cross_entropy.gaussian import Gaussian
 from jast._src.cross_entropy.mixture import Mixture
 from jast._src.cross_entropy.plan import MODES, check_objective, make_plan
 from jast._src.cross_entropy.result import CEResult
-from jast._src.util.checks import check_random_key
+from jast._src.util.checks import check_random_key, one_of
 
 Proposal: TypeAlias = "Gaussian | Mixture | tuple[Array, Numeric] | DistributionLike"
 
@@ -265,8 +265,7 @@ def start(
         >>> ce.finish(search).history.value.shape
         (30,)
     """
-    if method not in list(MODES):
-        raise ValueError(f"start: method must be one of {list(MODES)}, received {method!r}")
+    one_of("start", "method", method, MODES)
     check_random_key("start", key)
     plan, real, proposal = make_plan(method, proposal, **DEFAULTS | settings)
     return Search(iterate.begin(plan, key, proposal), real, plan)

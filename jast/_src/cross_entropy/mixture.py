@@ -17,6 +17,7 @@ from jast._src.cross_entropy import gaussian
 from jast._src.cross_entropy.gaussian import Gaussian
 from jast._src.runtime._jax import is_traced
 from jast._src.util import display
+from jast._src.util.checks import wrong
 
 __all__ = ["Mixture", "as_mixture", "em", "log_prob", "responsibilities", "sample"]
 
@@ -58,10 +59,8 @@ def as_mixture(proposal):
     k, d = means.shape if means.ndim == 2 else (0, 0)
     if not k or not d or weights.shape != (k,) or covariances.shape != (k, d, d):
         received = weights.shape, means.shape, covariances.shape
-        raise ValueError(
-            "proposal: weights must be [k], means [k, d] and covariances [k, d, d], received"
-            f" shapes {received}"
-        )
+        must = "be [k], means [k, d] and covariances [k, d, d]"
+        raise wrong("proposal", "weights", must, f"shapes {received}")
     if isinstance(means, jax.Array):
         return Mixture(weights, means, covariances)
     if not ((weights >= 0).all() and weights.sum() > 0):

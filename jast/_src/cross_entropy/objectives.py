@@ -19,7 +19,7 @@ from jax.tree_util import Partial
 from jast._src.core.typing import Array, Numeric, Objective
 from jast._src.cross_entropy.gaussian import widest_float
 from jast._src.runtime._jax import is_traced
-from jast._src.util.checks import real_number
+from jast._src.util.checks import real_number, truth_value, wrong
 
 __all__ = ["ackley", "branin", "paraboloid", "sierra"]
 
@@ -79,8 +79,7 @@ def sierra(
     """
     if order not in _PATHS:
         raise ValueError(f'sierra: order must be "code" or "thesis", received {order!r}')
-    if not isinstance(log, bool):
-        raise ValueError(f"sierra: log must be True or False, received {log!r}")
+    truth_value("sierra", log=log)
     try:
         given = jnp.asarray(mean) if is_traced(mean) else np.asarray(mean, float)
         good = given.shape == (2,) and (is_traced(mean) or np.isfinite(given).all())
@@ -184,8 +183,6 @@ def _vector(function, x, d=None):
     """``x`` as a vector of floats, of ``d`` numbers where d is given."""
     x = jnp.asarray(x)
     if x.ndim != 1 or x.size == 0 or d not in (None, x.size):
-        raise ValueError(
-            f"{function}: x must be a vector of {d or 'one or more'} numbers, received shape"
-            f" {x.shape}; for more points use jax.vmap"
-        )
+        must = f"be a vector of {d or 'one or more'} numbers"
+        raise wrong(function, "x", must, f"shape {x.shape}; for more points use jax.vmap")
     return x if jnp.issubdtype(x.dtype, jnp.floating) else x.astype(jnp.zeros(()).dtype)

@@ -13,7 +13,7 @@ from jast._src.cross_entropy.mixture import Mixture, as_mixture
 from jast._src.cross_entropy.schedules import counts
 from jast._src.cross_entropy.surrogates import KERNELS, RADIAL, SURROGATES, WARPS
 from jast._src.runtime._jax import is_traced
-from jast._src.util.checks import real_number, whole_number
+from jast._src.util.checks import one_of, real_number, truth_value, whole_number, wrong
 
 __all__ = ["MODES", "check_objective", "make_plan"]
 
@@ -53,10 +53,7 @@ def make_plan(
     """``(Plan, Settings, proposal)`` of ``method``; ``given``: settings of `MODES`, None where the
     mode's serves. Raises ValueError, as the methods say.
     """
-    if mode not in list(MODES[method]):
-        raise ValueError(
-            f"{method}: mode must be one of {sorted(MODES[method])}, received {mode!r}"
-        )
+    one_of(method, "mode", mode, sorted(MODES[method]))
     if unknown := sorted(set(given) - set(MODES[method][mode])):
         raise ValueError(
             f"{method}: expected settings among {sorted(MODES[method][mode])}, received"
@@ -73,10 +70,8 @@ def make_plan(
     sizes = tuple(n for n in sizes if n)  # an iteration without evaluations teaches nothing
     elites = whole_number(method, "elites", elites, 1)
     if elites > max(sizes):
-        raise ValueError(
-            f"{method}: elites must be at most the number of samples in an iteration,"
-            f" {max(sizes)}, received {elites}"
-        )
+        must = f"be at most the number of samples in an iteration, {max(sizes)}"
+        raise wrong(method, "elites", must, elites)
     kept = [min(elites, n) for n in sizes]
     if ratchet:
         kept = [min(kept[: i + 1]) for i in range(len(kept))]
@@ -88,14 +83,10 @@ def make_plan(
         frame=("initial", "window"),
         start=("elites", "searches"),
     ).items():
-        if name in chosen and chosen[name] not in allowed:
-            raise ValueError(
-                f"{method}: {name} must be one of {list(allowed)}, received {chosen[name]!r}"
-            )
+        if name in chosen:
+            one_of(method, name, chosen[name], allowed)
     truths = dict(elitism=chosen["elitism"], current=chosen.get("current", False), ratchet=ratchet)
-    for name, value in truths.items():
-        if not isinstance(value, bool):
-            raise ValueError(f"{method}: {name} must be True or False, received {value!r}")
+    truth_value(method, **truths)
     positive = (lambda v: 0 < v < math.inf), "above 0"
     other = (lambda v: 0 <= v < math.inf), "of at least 0"
     numbers = (
@@ -150,9 +141,7 @@ def _surrogate_plan(method, chosen, most, each, kept, d):
 def check_objective(method, objective, d, dtype):
     """``objective`` as a pytree, once it is a function [d] -> scalar that JAX can trace."""
     if not callable(objective):
-        raise ValueError(
-            f"{method}: objective must be a function x [{d}] -> scalar, received {objective!r}"
-        )
+        raise wrong(method, "objective", f"be a function x [{d}] -> scalar", f"{objective!r}")
     objective = as_pytree(objective)
     try:
         out = jax.eval_shape(objective, jax.ShapeDtypeStruct((d,), dtype))
@@ -167,9 +156,7 @@ def check_objective(method, objective, d, dtype):
         or out.dtype == bool
         or jnp.issubdtype(out.dtype, jnp.complexfloating)
     ):
-        raise ValueError(
-            f"{method}: objective must return one real number for x of shape ({d},), received {out}"
-        )
+        raise wrong(method, "objective", f"return one real number for x of shape ({d},)", out)
     return objective
 
 
@@ -183,10 +170,8 @@ def _elite_shares(method, given, each, kept, d):
     if given in ("elites", "dimension"):
         return [min(e / each, 1.0 if given == "elites" else 1 / d) for e in kept]
     if isinstance(given, bool) or not isinstance(given, Real) or not 0 < given <= 1:
-        raise ValueError(
-            f'{method}: selection must be "elites", "dimension", or a share above 0 and at most 1,'
-            f" received {given!r}"
-        )
+        must = 'be "elites", "dimension", or a share above 0 and at most 1'
+        raise wrong(method, "selection", must, f"{given!r}")
     return [given] * len(kept)
 
 
@@ -196,9 +181,7 @@ def _first_mixture(method, proposal, elites, components, asked):
         proposal = as_mixture(proposal)
         k = len(proposal.weights)
         if asked not in (None, k):
-            raise ValueError(
-                f"{method}: components must be as many as in the proposal, {k}, received {asked!r}"
-            )
+            raise wrong(method, "components", f"be as many as in the proposal, {k}", f"{asked!r}")
     else:
         g = as_gaussian(proposal)
         k = min(components or elites, elites)
@@ -211,8 +194,6 @@ def _first_mixture(method, proposal, elites, components, asked):
             jnp.broadcast_to(g.covariance[None], (k, d, d)),
         )
     if k > elites:
-        raise ValueError(
-            f"{method}: components must be at most the number of elites, {elites}, since each"
-            f" starts at one of them, received {k}"
-        )
+        must = f"be at most the number of elites, {elites}, since each starts at one of them"
+        raise wrong(method, "components", must, k)
     return proposal

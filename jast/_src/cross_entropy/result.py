@@ -10,6 +10,7 @@ from jast._src.core.typing import Array
 from jast._src.cross_entropy.gaussian import Gaussian
 from jast._src.cross_entropy.mixture import Mixture
 from jast._src.util import display
+from jast._src.util.checks import wrong
 
 __all__ = ["CEResult", "History", "Scores", "scores", "standard_error"]
 
@@ -157,10 +158,8 @@ def scores(result: CEResult, optimum: Array | None) -> Scores:
     x = np.asarray(result.history.best_x, float)
     value = np.asarray(result.history.best_value, float)
     if x.ndim != 3:
-        raise ValueError(
-            "scores: result must be a batch of runs, its history.best_x [runs, iterations, d],"
-            f" received {x.shape}"
-        )
+        must = "be a batch of runs, its history.best_x [runs, iterations, d]"
+        raise wrong("scores", "result", must, x.shape)
     optimum = np.asarray(optimum, float)
     if optimum.shape != x.shape[2:]:
         raise ValueError(f"scores: optimum must be [{x.shape[2]}], received shape {optimum.shape}")

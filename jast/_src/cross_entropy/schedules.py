@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from typing import Literal
 
 from jast._src.core.typing import Schedule
-from jast._src.util.checks import whole_number
+from jast._src.util.checks import number, one_of, whole_number, wrong
 
 __all__ = ["counts", "geometric", "manual", "uniform"]
 
@@ -54,12 +54,8 @@ def geometric(p: float = 0.1, normaliser: Literal["before", "after"] = "before")
         >>> schedules.geometric(0.5)(100, 3)
         (57, 28, 15)
     """
-    if isinstance(p, bool) or not isinstance(p, int | float) or not 0 < p < 1:
-        raise ValueError(f"geometric: p must be a number between 0 and 1, received {p!r}")
-    if normaliser not in ("before", "after"):
-        raise ValueError(
-            f'geometric: normaliser must be "before" or "after", received {normaliser!r}'
-        )
+    number("geometric", "p", p, lambda v: 0 < v < 1, "between 0 and 1")
+    one_of("geometric", "normaliser", normaliser, ("before", "after"))
 
     def schedule(budget, iterations):
         mass = [p * (1 - p) ** k for k in range(iterations + 1)]
@@ -159,8 +155,6 @@ def _whole(values):
     except TypeError:
         good = False
     if not good:
-        raise ValueError(
-            "schedule: counts must be whole numbers of at least 0, and not all 0, received"
-            f" {values!r}"
-        )
+        must = "be whole numbers of at least 0, and not all 0"
+        raise wrong("schedule", "counts", must, f"{values!r}")
     return sizes

@@ -27,6 +27,7 @@ from jast._src.cross_entropy.gaussian import Gaussian, normal
 from jast._src.cross_entropy.result import CEResult
 from jast._src.distributions.flat_rows import filled
 from jast._src.normal_space.sequences import latent_policy
+from jast._src.util.checks import wrong
 from jast._src.util.pytrees import index_tree
 
 __all__ = ["Stress", "over"]
@@ -138,15 +139,11 @@ def over(sim: Simulator, *, reward: Reward | None = None, actions: Actions | Non
         True
     """
     if reward is not None and not callable(reward):
-        raise ValueError(
-            f"over: reward must be a function, one of jast.rewards or yours, received {reward!r}"
-        )
+        raise wrong("over", "reward", "be a function, one of jast.rewards or yours", f"{reward!r}")
     actions = quantiles() if actions is None else actions
     if not isinstance(actions, Quantiles | UniformBox):
-        raise ValueError(
-            "over: actions must be jast.actions.quantiles() or uniform(low, high), received"
-            f" {actions!r}"
-        )
+        must = "be jast.actions.quantiles() or uniform(low, high)"
+        raise wrong("over", "actions", must, f"{actions!r}")
     contract("over", sim)
     signature = signature_of(sim)
     box = isinstance(actions, UniformBox)

@@ -18,7 +18,7 @@ from jast._src.estimate.estimate import Estimate, estimate_from_weights
 from jast._src.estimate.importance_sampling import Traces, chunks, one_trace
 from jast._src.estimate.proposals import Proposal, as_proposal
 from jast._src.runtime.progress_bar import Watch
-from jast._src.util.checks import check_random_key, whole_number
+from jast._src.util.checks import check_random_key, whole_number, wrong
 from jast._src.util.display import call_settings
 from jast._src.util.intervals import checked_level
 
@@ -85,10 +85,8 @@ def double_loop(
     contract(name, sim)
     proposal = as_proposal(name, sim, proposal)
     if len(proposal.log_weights) > 1:
-        raise ValueError(
-            f"{name}: proposal must have one component, since its traces share their start,"
-            f" received {len(proposal.log_weights)}"
-        )
+        must = "have one component, since its traces share their start"
+        raise wrong(name, "proposal", must, len(proposal.log_weights))
     settings = call_settings(name, key, starts=starts, samples=samples, level=level)
     lanes = max(1, min(starts, MAX_LANES // samples))
     watch = Watch(name, starts, "start", progress, callback)

@@ -37,7 +37,7 @@ from jast._src.estimate.weighted_draws import (
 )
 from jast._src.normal_space.transform import dimension, policy_of
 from jast._src.util import display
-from jast._src.util.checks import check_random_key, whole_number
+from jast._src.util.checks import check_random_key, one_of, whole_number, wrong
 from jast._src.util.intervals import clopper_pearson, log_normal
 from jast._src.util.pytrees import as_partial, select, zero_where
 
@@ -153,8 +153,7 @@ def events(
     """
     name = "events"
     draws, level = draws_and_level(name, estimate, level)
-    if of not in EVENT_ARGUMENTS:
-        raise ValueError(f"{name}: of must be one of {EVENT_ARGUMENTS}, received {of!r}")
+    one_of(name, "of", of, EVENT_ARGUMENTS)
     functions = _check_functions(name, named)
     happened = _evaluate_events(name, sim, estimate, draws, functions, of, proposal)
     return {k: _event(estimate, draws, v, level) for k, v in happened.items()}
@@ -277,10 +276,8 @@ def _evaluate_events(name, sim, estimate, draws, functions, of, proposal):
     if not len(rows):
         raise ValueError(f"{name}: estimate must have seen a failure, received one that saw none")
     if (received := dimension_of(draws.source)) not in (None, dimension(sim)):
-        raise ValueError(
-            f"{name}: sim must be the simulator of the estimate, with {received} random"
-            f" numbers in an episode, received one with {dimension(sim)}"
-        )
+        must = f"be the simulator of the estimate, with {received} random numbers in an episode"
+        raise wrong(name, "sim", must, f"one with {dimension(sim)}")
     by_policy = draws.source == "policy"
     if by_policy and proposal is None:
         raise ValueError(f"{name}: proposal must be the one that the estimate was made with")

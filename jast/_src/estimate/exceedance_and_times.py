@@ -24,7 +24,7 @@ from jast._src.estimate.weighted_draws import (
     share_interval,
 )
 from jast._src.util import display
-from jast._src.util.checks import number
+from jast._src.util.checks import instance, number
 from jast._src.util.intervals import checked_level
 
 __all__ = [
@@ -273,10 +273,7 @@ def failure_times(estimate: Estimate, *, level: float | None = None) -> FailureT
 
 def draws_and_level(name: str, estimate: Any, level: float | None) -> tuple[Draws, float]:
     """(`Draws`, level) of an ``estimate``; ValueError where it holds none."""
-    if not isinstance(estimate, Estimate):
-        raise ValueError(
-            f"{name}: estimate must be a jast.estimate.Estimate, received {type(estimate).__name__}"
-        )
+    instance(name, "estimate", estimate, Estimate, "a jast.estimate.Estimate")
     level = estimate.level if level is None else checked_level(name, level)
     if not isinstance(estimate.draws, Draws) or not estimate.draws.samples:
         raise ValueError(

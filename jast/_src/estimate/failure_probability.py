@@ -27,7 +27,7 @@ from jast._src.runtime import work
 from jast._src.runtime._jax import briefly
 from jast._src.runtime.checkpoints import keep_answers, open_checkpoint
 from jast._src.runtime.host_errors import runs_on_host
-from jast._src.util.checks import check_random_key, whole_number
+from jast._src.util.checks import check_random_key, whole_number, wrong
 from jast._src.util.display import call_settings
 from jast._src.util.intervals import checked_level
 
@@ -180,10 +180,8 @@ def failure_probability(
     if near is not None and not isinstance(near, Estimate):
         raise ValueError(f"{name}: near must be an Estimate, received {type(near).__name__}")
     if failures is not None and not isinstance(failures, Failures):
-        raise ValueError(
-            f"{name}: failures must be an archive of jast.failures, as the failures of a search,"
-            f" received {type(failures).__name__}"
-        )
+        must = "be an archive of jast.failures, as the failures of a search"
+        raise wrong(name, "failures", must, type(failures).__name__)
     similar = None if near is None else near.proposal
     if isinstance(similar, Sample) or not is_proposal_of(sim, similar):  # a sample draws nothing
         similar = None

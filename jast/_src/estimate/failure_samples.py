@@ -28,7 +28,7 @@ from jast._src.normal_space import transform
 from jast._src.runtime.checkpoints import answer_once, keep_answers, open_checkpoint
 from jast._src.runtime.memory import require_episodes
 from jast._src.util import display
-from jast._src.util.checks import check_random_key, whole_number
+from jast._src.util.checks import check_random_key, whole_number, wrong
 from jast._src.util.pytrees import index_tree
 
 __all__ = ["FailureSamples", "failure_samples"]
@@ -132,10 +132,8 @@ def failure_samples(
     transform.check(name, sim)
     q = source.proposal if isinstance(source, Estimate) else source
     if q is None and isinstance(source, Estimate):
-        raise ValueError(
-            f"{name}: source must hold a proposal, received an estimate by {source.method} without"
-            " one"
-        )
+        must = "hold a proposal"
+        raise wrong(name, "source", must, f"an estimate by {source.method} without one")
     require_episodes(name, sim, DRAWS_PER_SAMPLE * samples)
     about = dict(sim=sim, source=q, samples=samples, moves=moves)
     with open_checkpoint(name, checkpoint, key, **about) as store, keep_answers(store):
@@ -158,10 +156,8 @@ def _draw_failures(name, key, sim, q, samples, moves):
         z, failure = transform.normal_of(sim, e), e.failure
     log_w = np.where(failure & np.isfinite(log_w), log_w, -np.inf).astype(np.float64)
     if not np.isfinite(log_w).any():
-        raise ValueError(
-            f"{name}: source must be a proposal under which failures are frequent, received one"
-            f" with no failure in {n} episodes"
-        )
+        must = "be a proposal under which failures are frequent"
+        raise wrong(name, "source", must, f"one with no failure in {n} episodes")
     rows = resample(log_w, samples, float(jax.random.uniform(for_rows)))
     moved, sampler = equilibrate(key, sim, z[rows], moves)
     episodes = answer_once(partial(transform.episodes, sim), moved.z)

@@ -38,7 +38,7 @@ from jast._src.runtime.checkpoints import open_checkpoint
 from jast._src.runtime.memory import require_episodes
 from jast._src.runtime.progress_bar import Watch
 from jast._src.util import display
-from jast._src.util.checks import check_random_key, whole_number
+from jast._src.util.checks import check_random_key, one_of, whole_number
 from jast._src.util.display import call_settings
 from jast._src.util.intervals import checked_level
 from jast._src.util.pytrees import index_tree
@@ -129,8 +129,7 @@ def log_weights(
 
 
 def _goes_to_horizon(function, mode):
-    if mode not in ("default", "paper"):
-        raise ValueError(f'{function}: mode must be "default" or "paper", received {mode!r}')
+    one_of(function, "mode", mode, ("default", "paper"))
     return mode == "paper"
 
 

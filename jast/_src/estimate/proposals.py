@@ -27,7 +27,7 @@ from jast._src.distributions.mixtures import blend
 from jast._src.normal_space.transform import latents
 from jast._src.runtime._jax import is_traced
 from jast._src.util import display
-from jast._src.util.checks import real_number
+from jast._src.util.checks import instance, one_of, real_number, wrong
 from jast._src.util.pytrees import conform, index_tree
 
 __all__ = ["Proposal", "as_proposal", "policy_proposal", "trace_proposal"]
@@ -170,10 +170,7 @@ def policy_proposal(
     """
     epsilon = _epsilon("policy_proposal", epsilon, mixing)
     contract("policy_proposal", sim)
-    if not isinstance(policy, Policy):
-        raise ValueError(
-            f"policy_proposal: policy must be a jast.Policy, received {type(policy).__name__}"
-        )
+    instance("policy_proposal", "policy", policy, Policy, "a jast.Policy")
     tilt_start = tilt_start and signature_of(sim).random_start
     share = epsilon if mixing == "step" else None
     strength = jnp.ones((1,), epsilon.dtype)
@@ -201,11 +198,7 @@ def as_proposal(function, sim, proposal):
     if isinstance(proposal, Policy):
         stacked = jax.tree.map(lambda a: jnp.asarray(a)[None], proposal)
         proposal = Proposal(jnp.zeros(1), stacked)
-    if not isinstance(proposal, Proposal):
-        raise ValueError(
-            f"{function}: proposal must be a Proposal or a jast.Policy, received"
-            f" {type(proposal).__name__}"
-        )
+    instance(function, "proposal", proposal, Proposal, "a Proposal or a jast.Policy")
 
     def plays_one_value(start: Any, state: Any, dist: Any) -> bool:
         policy = index_tree(proposal.policies, 0)
@@ -223,8 +216,7 @@ def as_proposal(function, sim, proposal):
 
 
 def _epsilon(function, epsilon, mixing):
-    if mixing not in MIXING:
-        raise ValueError(f'{function}: mixing must be "step" or "trace", received {mixing!r}')
+    one_of(function, "mixing", mixing, MIXING)
     return real_number(function, "epsilon", epsilon, lambda v: 0 < v <= 1, "above 0 and at most 1")
 
 
@@ -233,10 +225,8 @@ def _stacked(sim, episodes):
     several = isinstance(episodes, (list, tuple)) and not hasattr(episodes, "_fields")
     parts = list(episodes) if several else [episodes]
     if not parts or not all(isinstance(e, Episode) for e in parts):
-        raise ValueError(
-            "trace_proposal: episodes must be a jast.Episode, a batch of them or a list, received"
-            f" {[type(e).__name__ for e in parts]}"
-        )
+        must = "be a jast.Episode, a batch of them or a list"
+        raise wrong("trace_proposal", "episodes", must, [type(e).__name__ for e in parts])
     fields = [(e.x0, e.disturbances, e.length) for e in parts]
     batched = [
         f if np.ndim(f[2]) else jax.tree.map(lambda a: jnp.asarray(a)[None], f) for f in fields

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 from jax.tree_util import Partial
 
 from jast._src.core.typing import PRNGKey
+from jast._src.util.checks import one_of
 
 __all__ = ["ACTIVATIONS", "Head", "adam", "adam_step", "dense", "make_head"]
 
@@ -86,10 +87,7 @@ def make_head(
             "make_head: inputs, hidden and outputs must be integers of at least 1, received"
             f" {inputs!r}, {hidden!r} and {outputs!r}"
         )
-    if activation not in ACTIVATIONS:
-        raise ValueError(
-            f"make_head: activation must be one of {sorted(ACTIVATIONS)}, received {activation!r}"
-        )
+    one_of("make_head", "activation", activation, ACTIVATIONS)
     init, apply = dense(tuple(hidden), tuple(outputs), activation, first_activation)
     return Head(init(key, jnp.zeros((inputs,), jnp.float32)), apply)
 

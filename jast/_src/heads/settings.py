@@ -9,6 +9,8 @@ from collections.abc import Callable
 from numbers import Real
 from typing import Any, Literal, NamedTuple
 
+from jast._src.util.checks import one_of
+
 __all__ = ["MODES", "HeadSettings", "check_settings", "settings"]
 
 
@@ -201,8 +203,7 @@ def settings(
         >>> jast.heads.settings("code", round=8).round
         8
     """
-    if mode not in MODES:
-        raise ValueError(f"heads.settings: mode must be one of {sorted(MODES)}, received {mode!r}")
+    one_of("heads.settings", "mode", mode, MODES)
     if unknown := sorted(set(changes) - set(HeadSettings._fields)):
         raise ValueError(
             f"heads.settings: expected settings among {', '.join(HeadSettings._fields)}, received"

@@ -15,7 +15,7 @@ from jast._src.heads.heads import Heads
 from jast._src.heads.networks import ACTIVATIONS, Head, dense
 from jast._src.io import save_load
 from jast._src.io.codec import Given, check_fits
-from jast._src.util.checks import whole_number
+from jast._src.util.checks import instance, whole_number, wrong
 
 __all__ = ["load", "parts", "whole"]
 
@@ -50,20 +50,16 @@ def parts(heads: Heads) -> dict[str, Any]:
     for name in HEADS:
         head = getattr(heads, name)
         if head is not None and not isinstance(head, Head):
-            raise ValueError(
-                f"save: the {name} head must be a pair (params, apply), received"
-                f" {type(head).__name__}"
-            )
+            must = "be a pair (params, apply)"
+            raise wrong("save", f"the {name} head", must, type(head).__name__)
         fields[name] = head and dict(network=_specification(head), params=head.params)
     return fields
 
 
 def whole(path: Any, fields: dict[str, Any], given: Given) -> Heads:
     """The heads of `parts`, with the functions of those that are ``given``, if any."""
-    if given.heads is not None and not isinstance(given.heads, Heads):
-        raise ValueError(
-            f"load: heads must be jast.heads.Heads, received {type(given.heads).__name__}"
-        )
+    if given.heads is not None:
+        instance("load", "heads", given.heads, Heads, "jast.heads.Heads")
     heads = {
         name: _head(path, name, fields.get(name), getattr(given.heads, name, None))
         for name in HEADS

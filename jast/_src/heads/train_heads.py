@@ -26,6 +26,7 @@ from jast._src.heads.networks import make_head
 from jast._src.heads.samples import Samples, samples_of_edges, samples_of_episodes, samples_of_roots
 from jast._src.heads.train_head import HeadState, init_head, train_head
 from jast._src.runtime._jax import is_traced
+from jast._src.util.checks import wrong
 from jast._src.util.pytrees import count_numbers, index_tree, shapes_text
 
 __all__ = ["HeadTraining", "init_heads", "train_heads", "with_moments"]
@@ -74,14 +75,10 @@ def count_inputs(sim: Simulator, actions: Any, heads: str | Heads) -> tuple[int,
     serve.
     """
     if not isinstance(heads, Heads) and heads not in ("rollout", "value", "both"):
-        raise ValueError(
-            'forest: heads must be None, "rollout", "value", "both" or jast.heads.Heads, received'
-            f" {heads!r}"
-        )
+        must = 'be None, "rollout", "value", "both" or jast.heads.Heads'
+        raise wrong("forest", "heads", must, f"{heads!r}")
     if isinstance(heads, Heads) and heads.policy is None and heads.value is None:
-        raise ValueError(
-            "forest: heads must have a policy or a value head, received Heads(None, None)"
-        )
+        raise wrong("forest", "heads", "have a policy or a value head", "Heads(None, None)")
 
     if heads in ("rollout", "both") if isinstance(heads, str) else heads.policy is not None:
         try:
@@ -101,10 +98,8 @@ def with_moments(heads: Heads, n: int, d: int) -> Heads:
     """``heads`` with moments that leave everything as it is, where there are none."""
     inputs = Moments.empty(n + d) if heads.inputs is None else heads.inputs
     if inputs.mean.shape != (n + d,):
-        raise ValueError(
-            f"forest: heads must take {n + d} numbers ({n} observed, {d} of the disturbance),"
-            f" received heads that take {inputs.mean.shape[0]}"
-        )
+        must = f"take {n + d} numbers ({n} observed, {d} of the disturbance)"
+        raise wrong("forest", "heads", must, f"heads that take {inputs.mean.shape[0]}")
     returns = Moments.empty() if heads.returns is None else heads.returns
     return dataclasses.replace(heads, inputs=inputs, returns=returns)
 

@@ -17,7 +17,7 @@ from jast._src.core.episode import Episode, replay
 from jast._src.core.signature import signature_of
 from jast._src.core.simulator import Simulator
 from jast._src.core.typing import PathLike
-from jast._src.util.checks import check_path
+from jast._src.util.checks import check_path, wrong
 from jast._src.util.leaf_names import path_name
 
 __all__ = ["by_step", "from_json", "to_csv", "to_numpy"]
@@ -147,20 +147,18 @@ def from_json(path: PathLike, sim: Simulator) -> Episode:
         check_path("from_json", path)
         given = json.loads(Path(path).read_text(encoding="utf-8"))
         parts = [{a["name"]: a for a in given[name]} for name in ("x0", "disturbances")]
-    except (json.JSONDecodeError, UnicodeDecodeError, KeyError, TypeError) as wrong:
+    except (json.JSONDecodeError, UnicodeDecodeError, KeyError, TypeError) as error:
         raise ValueError(
             f"from_json: path must be a file from the page of a report, received {str(path)!r},"
-            f" which is not one: {wrong!r}"
+            f" which is not one: {error!r}"
         ) from None
     like, wholes = signature_of(sim), []
     for name, part in zip(("x0", "x"), parts, strict=True):
         pairs, treedef = jax.tree_util.tree_flatten_with_path(getattr(like, name))
         names = [path_name(at) for at, _ in pairs]
         if set(names) != set(part):
-            raise ValueError(
-                f"from_json: sim must be the simulator of the failure, whose {name} has the fields"
-                f" {sorted(part)}, received one with {sorted(names)}"
-            )
+            must = f"be the simulator of the failure, whose {name} has the fields {sorted(part)}"
+            raise wrong("from_json", "sim", must, f"one with {sorted(names)}")
         arrays = [np.array(part[name]["values"], part[name]["dtype"]) for name in names]
         if name == "x":  # of no step there is no shape
             arrays = [

@@ -14,6 +14,7 @@ import numpy as np
 from jast._src.core.episode import Episode, replay
 from jast._src.core.simulator import Simulator
 from jast._src.runtime.host_errors import runs_on_host
+from jast._src.util.checks import wrong
 from jast._src.util.leaf_names import named_fields, path_name
 from jast._src.util.pytrees import index_tree
 
@@ -165,10 +166,8 @@ def pictures(
             past = {"past": index_tree(states, np.s_[:t])} if trails else {}
             found[t] = draw(index_tree(states, t), **past)
             if not isinstance(found[t], str):
-                raise ValueError(
-                    f"{caller}: draw must return a str, an SVG or HTML fragment, received"
-                    f" {type(found[t]).__name__}"
-                )
+                must = "return a str, an SVG or HTML fragment"
+                raise wrong(caller, "draw", must, type(found[t]).__name__)
         return found[t]
 
     longest = max(1, _length(drawn(steps[0])), _length(drawn(steps[-1])))

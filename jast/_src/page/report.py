@@ -13,7 +13,7 @@ from jast._src.core.simulator import Simulator
 from jast._src.page.document import document, plain, rows, table, text, write
 from jast._src.page.episode_data import exact, groups, pictures, short, states_of, trace
 from jast._src.stress_testing import report_words
-from jast._src.util.checks import check_path
+from jast._src.util.checks import check_path, wrong
 
 __all__ = ["write_report"]
 
@@ -63,10 +63,8 @@ def write_report(
     if draw is not None and not callable(draw):
         raise ValueError(f"Report.html: draw must be a function of a state, received {draw!r:.80}")
     if isinstance(explanations, str) or not isinstance(explanations, Sequence):
-        raise ValueError(
-            "Report.html: explanations must be a sequence, of one for each mode, received"
-            f" {type(explanations).__name__}"
-        )
+        must = "be a sequence, of one for each mode"
+        raise wrong("Report.html", "explanations", must, type(explanations).__name__)
     if draw is not None and sim is None:
         raise ValueError(
             "Report.html: draw needs the simulator, which a report from a file does not hold:"
@@ -74,10 +72,8 @@ def write_report(
         )
     failures = report_words.shown_failures(report, MODES)
     if len(explanations) > len(failures):
-        raise ValueError(
-            f"Report.html: explanations must be at most {len(failures)}, one for each mode shown,"
-            f" received {len(explanations)}"
-        )
+        must = f"be at most {len(failures)}, one for each mode shown"
+        raise wrong("Report.html", "explanations", must, len(explanations))
     told = [_as_list(one) for one in explanations]
     told += [[]] * (len(failures) - len(told))
     data = {"modes": _data(report, failures, told, sim, draw)}

@@ -9,6 +9,7 @@ import numpy as np
 
 from jast._src.page.document import document, rows, write
 from jast._src.page.episode_data import groups, short
+from jast._src.util.checks import wrong
 from jast._src.util.pytrees import index_tree
 
 __all__ = ["nodes_of", "write_tree"]
@@ -61,10 +62,8 @@ def nodes_of(caller: str, result: Any, tree: int | None = None) -> Nodes:
     """
     found = getattr(result, "trees", None)
     if found is None:
-        raise ValueError(
-            f"{caller}: result must be of jast.search.mcts or forest with keep_trees=True, received"
-            f" a {type(result).__name__} without trees"
-        )
+        must = "be of jast.search.mcts or forest with keep_trees=True"
+        raise wrong(caller, "result", must, f"a {type(result).__name__} without trees")
     found = jax.tree.map(np.asarray, found)
     made, trees = found.visits > 0, found.visits.shape[1]
     value = np.where(made & np.isfinite(found.reward), found.reward, -np.inf)

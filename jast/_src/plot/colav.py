@@ -281,10 +281,8 @@ class _Panel:
 def _states(caller, episode, sim):
     """s_0 .. s_length as NumPy arrays."""
     if style.one_episode(caller, episode).states is None and sim is None:
-        raise ValueError(
-            f"plot.{caller}: episode must have states, or sim be the simulator to replay it on,"
-            " received neither"
-        )
+        must = "have states, or sim be the simulator to replay it on"
+        raise style.wrong(caller, "episode", must, "neither")
     states = style.states_of(caller, episode, sim, "colav", ColavState)
     return jax.tree.map(lambda a: np.asarray(a)[: int(episode.length) + 1], states)
 

@@ -135,10 +135,8 @@ def surrogate_samples(
     judged = np.asarray(result.history.model_x, float)[k - 1]
     judged = judged[np.isfinite(judged).all(1)]
     if not len(judged):
-        raise ValueError(
-            f"plot.{caller}: result must be of a method with a surrogate, received one whose"
-            " history.model_x is empty"
-        )
+        must = "be of a method with a surrogate"
+        raise style.wrong(caller, "result", must, "one whose history.model_x is empty")
     now = log.x[log.iteration == k - 1]
     low, high = np.quantile(judged, [0.01, 0.99], axis=0)
     near = np.clip(np.concatenate([judged, now]), low, high)
@@ -194,9 +192,7 @@ def convergence(
     caller = "convergence"
     results = style.by_name(results)
     if not results:
-        raise ValueError(
-            "plot.convergence: results must hold at least one batch of runs, received none"
-        )
+        raise style.wrong("convergence", "results", "hold at least one batch of runs", "none")
     for name, result in results.items():
         if not isinstance(result, CEResult) or np.ndim(result.best_value) != 1:
             received = type(result).__name__
@@ -255,15 +251,12 @@ def _log(caller, result):
     """The `_Log` of one run in the plane, or a ValueError."""
     style.checked_kind(caller, "result", result, CEResult, "a CEResult")
     if np.ndim(result.best_value):
-        raise ValueError(
-            f"plot.{caller}: result must be one run, received one with leading axes"
-            f" {np.shape(result.best_value)}"
+        raise style.wrong(
+            caller, "result", "be one run", f"one with leading axes {np.shape(result.best_value)}"
         )
     if np.size(result.best_x) != 2:
-        raise ValueError(
-            f"plot.{caller}: result must be of an objective of 2 numbers, received"
-            f" {np.size(result.best_x)}"
-        )
+        must = "be of an objective of 2 numbers"
+        raise style.wrong(caller, "result", must, np.size(result.best_x))
     log = _Log(result.history)
     if not len(log.x):
         raise ValueError(f"plot.{caller}: result must have evaluations, received none")
@@ -288,9 +281,7 @@ def _boxes(caller, bounds, panels):
     if bounds is not None:
         box = np.asarray(bounds, float)
         if box.shape != (2, 2) or not np.isfinite(box).all() or not (box[:, 0] < box[:, 1]).all():
-            raise ValueError(
-                f"plot.{caller}: bounds must be ((low, high), (low, high)), received {bounds!r}"
-            )
+            raise style.wrong(caller, "bounds", "be ((low, high), (low, high))", f"{bounds!r}")
         return [box] * len(panels)
     panels = [x[np.isfinite(x).all(1)] for x in panels]
     sides = np.array([np.max(np.ptp(x, axis=0)) for x in panels])

@@ -49,9 +49,7 @@ def exceedance(
     style.checked_kinds(caller, "curves", named.values(), Exceedance | Estimate, words)
     named = {k: curve_of(c) if isinstance(c, Estimate) else c for k, c in named.items()}
     if not all(np.isfinite(c.probability).any() for c in named.values()):
-        raise ValueError(
-            f"plot.{caller}: curves must hold at least one probability, received only NaN"
-        )
+        raise style.wrong(caller, "curves", "hold at least one probability", "only NaN")
     with style.axes(ax, (6.8, 3.8)) as ax:
         ax.axvline(0.0, color=style.INK, linewidth=1.0, linestyle=style.DOTTED, label="failure")
         for i, (name, c) in enumerate(named.items()):

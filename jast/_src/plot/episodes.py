@@ -48,18 +48,14 @@ def history(
         means, bests = [], []
         for i, (name, result) in enumerate(style.by_name(results).items()):
             if not hasattr(getattr(result, "history", None), "best_reward"):
-                raise ValueError(
-                    "plot.history: results must be a jast.SearchResult, or a dict of name ->"
-                    f" result, received {type(result).__name__}"
-                )
+                must = "be a jast.SearchResult, or a dict of name -> result"
+                raise style.wrong("history", "results", must, type(result).__name__)
             episodes = np.asarray(result.history.simulations)
             best = np.asarray(result.history.best_reward, float)
             best = np.where(np.isfinite(best), best, np.nan)  # no valid episode yet: not drawn
             if best.ndim != 2 or episodes.shape != best.shape[:1]:
-                raise ValueError(
-                    "plot.history: history must have simulations [C] and best_reward [C, trees],"
-                    f" received {episodes.shape} and {best.shape}"
-                )
+                must = "have simulations [C] and best_reward [C, trees]"
+                raise style.wrong("history", "history", must, f"{episodes.shape} and {best.shape}")
             colour, trees = style.colour(i), best.shape[1]
             if total:
                 episodes, best, trees = episodes * trees, np.fmax.reduce(best, 1, keepdims=True), 1
@@ -198,15 +194,11 @@ def distances(
         >>> ax = jast.plot.distances(many, labels=["nominal"])
     """
     if not episodes or not all(isinstance(e, Episode) for e in episodes):
-        raise ValueError(
-            "plot.distances: episodes must be one or more Episodes, received"
-            f" {[type(e).__name__ for e in episodes]}"
-        )
+        must = "be one or more Episodes"
+        raise style.wrong("distances", "episodes", must, [type(e).__name__ for e in episodes])
     labels = [f"batch {i + 1}" for i in range(len(episodes))] if labels is None else list(labels)
     if len(labels) != len(episodes):
-        raise ValueError(
-            f"plot.distances: labels must be {len(episodes)} names, received {len(labels)}"
-        )
+        raise style.wrong("distances", "labels", f"be {len(episodes)} names", len(labels))
     batches = [
         (np.ravel(e.distance).astype(float), np.ravel(e.failure).astype(bool)) for e in episodes
     ]

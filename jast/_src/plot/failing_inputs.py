@@ -64,17 +64,13 @@ def first_failures(
     count = whole_number(f"plot.{caller}", "count", count)
     inputs, labels, _ = check_data(f"plot.{caller}", inputs, labels)
     if len(inputs) != n:
-        raise ValueError(
-            f"plot.{caller}: inputs must be those of the result, {n}, received {len(inputs)}"
-        )
+        raise style.wrong(caller, "inputs", f"be those of the result, {n}", len(inputs))
     if inputs.ndim not in (3, 4) or inputs.ndim == 4 and inputs.shape[3] not in (1, 3, 4):
         received = f"shape {inputs.shape}"
         if inputs.ndim == 2:
             received = f"rows of a table, {received}: reshape them if they are images"
-        raise ValueError(
-            f"plot.{caller}: inputs must be images [n, height, width] or [n, height, width, 1, 3 or"
-            f" 4 channels], received {received}"
-        )
+        must = "be images [n, height, width] or [n, height, width, 1, 3 or 4 channels]"
+        raise style.wrong(caller, "inputs", must, received)
     said, true = np.asarray(result.predicted)[failures], labels[failures]
     if (same := int(np.sum(said == true))) > 0:
         raise ValueError(
@@ -142,10 +138,8 @@ def contributions(
     values = _numbers(values)
     if values is None or values.ndim not in (2, 3, 4) or 0 in values.shape[1:]:
         received = "no such array" if values is None else f"shape {values.shape}"
-        raise ValueError(
-            f"plot.{caller}: values must be [k, columns], [k, height, width] or [k, height, width,"
-            f" channels], received {received}"
-        )
+        must = "be [k, columns], [k, height, width] or [k, height, width, channels]"
+        raise style.wrong(caller, "values", must, received)
     if not np.isfinite(values).all():
         raise ValueError(
             f"plot.{caller}: values must be finite, {int(np.sum(~np.isfinite(values)))} are not"
@@ -161,15 +155,11 @@ def _bars(caller, values, names, background, ax):
     """`contributions` of the columns of a table."""
     k, d = values.shape
     if background is not None:
-        raise ValueError(
-            f"plot.{caller}: background must be None for rows of a table, received"
-            f" {type(background).__name__}"
-        )
+        must = "be None for rows of a table"
+        raise style.wrong(caller, "background", must, type(background).__name__)
     names = [f"column {i}" for i in range(d)] if names is None else [str(name) for name in names]
     if len(names) != d:
-        raise ValueError(
-            f"plot.{caller}: names must be {d}, one for each column, received {len(names)}"
-        )
+        raise style.wrong(caller, "names", f"be {d}, one for each column", len(names))
     size, mean = np.abs(values).mean(0), values.mean(0)
     chosen = np.argsort(-size, kind="stable")[:BARS]
     with style.axes(ax, (6.8, 1.2 + 0.3 * len(chosen))) as ax:
@@ -198,9 +188,7 @@ def _map(caller, values, names, background, ax):
     from matplotlib.colors import LinearSegmentedColormap
 
     if names is not None:
-        raise ValueError(
-            f"plot.{caller}: names must be None for images, received {type(names).__name__}"
-        )
+        raise style.wrong(caller, "names", "be None for images", type(names).__name__)
     size = np.abs(values).mean(0)
     size = size.sum(2) if size.ndim == 3 else size
     if background is not None:
@@ -210,10 +198,8 @@ def _map(caller, values, names, background, ax):
             received = "no such array"
             if given is not None:
                 received = f"shape {given.shape}{'' if finite else ' with numbers that are not'}"
-            raise ValueError(
-                f"plot.{caller}: background must be finite {list(size.shape)} or with channels,"
-                f" received {received}"
-            )
+            must = f"be finite {list(size.shape)} or with channels"
+            raise style.wrong(caller, "background", must, received)
         background = given.mean(2) if given.ndim == 3 else given
     tall = float(np.clip(size.shape[0] / size.shape[1], 0.3, 2.0))
     with style.axes(ax, (5.0, max(3.75 * tall + 0.5, 3.2)), layout="compressed") as ax:
@@ -241,10 +227,8 @@ def _words(caller, names, largest):
         return str
     listed = isinstance(names, list | tuple | np.ndarray)
     if not listed or len(names) <= largest:
-        raise ValueError(
-            f"plot.{caller}: names must be a list of one for each class, at least {largest + 1},"
-            f" received {len(names) if listed else type(names).__name__}"
-        )
+        must = f"be a list of one for each class, at least {largest + 1}"
+        raise style.wrong(caller, "names", must, len(names) if listed else type(names).__name__)
     return lambda label: str(names[label])
 
 

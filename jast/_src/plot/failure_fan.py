@@ -102,10 +102,8 @@ def _rows(caller: str, sim: Simulator, episodes: Episode, value: Any) -> list[np
         played = series.series_of(sim, episodes)
         names = series.choose_fields(caller, value, played, 1)
         if len(names) > 1:
-            raise ValueError(
-                f"plot.{caller}: value must name one number of {names}, received {value!r}, which"
-                " names them all"
-            )
+            must = f"name one number of {names}"
+            raise style.wrong(caller, "value", must, f"{value!r}, which names them all")
         out = played.columns[names[0]]
     else:
 
@@ -115,9 +113,7 @@ def _rows(caller: str, sim: Simulator, episodes: Episode, value: Any) -> list[np
 
         out = np.asarray(jax.jit(jax.vmap(numbers))(episodes), float)
     if out.ndim != 2:
-        raise ValueError(
-            f"plot.{caller}: value must return one number, received shape {out.shape[2:]}"
-        )
+        raise style.wrong(caller, "value", "return one number", f"shape {out.shape[2:]}")
     return [row[: int(n) + 1] for row, n in zip(out, episodes.length, strict=True)]
 
 

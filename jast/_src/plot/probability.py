@@ -102,10 +102,8 @@ def weights(traces: Traces, ax: Axes | None = None) -> Axes:
     with style.axes(ax, (6.8, 3.8)) as ax:
         for i, (name, t) in enumerate(traces.items()):
             if not isinstance(t, Traces) or np.ndim(t.log_weight) != 1:
-                raise ValueError(
-                    "plot.weights: traces must be Traces with one leading axis or a dict of them,"
-                    f" received {type(t).__name__}"
-                )
+                must = "be Traces with one leading axis or a dict of them"
+                raise style.wrong("weights", "traces", must, type(t).__name__)
             log_w, n = np.asarray(t.log_weight, float)[np.asarray(t.failure)], len(t.failure)
             log_w = np.sort(log_w[np.isfinite(log_w)])[::-1]
             if len(log_w) < 2:

@@ -73,9 +73,7 @@ def report(
     import matplotlib.pyplot as plt
 
     if name_of(report) != "Report":
-        raise ValueError(
-            f"plot.report: report must be of jast.stress, received a {type(report).__name__}"
-        )
+        raise style.wrong("report", "report", "be of jast.stress", f"a {type(report).__name__}")
     sim = report.sim if sim is None else sim
     shown = report_words.shown_failures(report)
     told = report_words.belief(report.probability)
@@ -221,7 +219,7 @@ def _draw_mode(
 ) -> None:
     """The panels of mode ``k``."""
     if owned:
-        _draw_traces(page, *owned, k, units, legend=legend)
+        _draw_traces(page, owned, k, units, legend)
     x, wide = MARGIN + 0.45 + (5.1 if owned else 0.0), 1.88 if owned else 5.0
     _draw_disturbances(page.axes(x, wide, PANEL, 0.2), sim, failure)
 
@@ -237,17 +235,9 @@ def _failures(report: Any, sim: Any, shown: list) -> tuple[Episode, np.ndarray]:
     return stacked((*shown, *more)), np.concatenate([np.arange(len(shown)), others])
 
 
-def _draw_traces(
-    page: _Page,
-    mode: np.ndarray,
-    own: Series,
-    behind: Series | None,
-    quiet: Series | None,
-    k: int,
-    units: Any,
-    legend: bool,
-) -> None:
+def _draw_traces(page: _Page, owned: tuple, k: int, units: Any, legend: bool) -> None:
     """Two panels of mode ``k``."""
+    mode, own, behind, quiet = owned
     rows = np.flatnonzero(mode == k)[: FAILURES + 1]
     part = Series({n: a[rows] for n, a in own.columns.items()}, own.length[rows], own.state)
     names = _most_unusual(part, behind)

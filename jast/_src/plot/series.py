@@ -19,7 +19,7 @@ from jast._src.plot import style
 from jast._src.runtime.host_errors import runs_on_host
 from jast._src.search.refine.modes import Mode, Modes, owners
 from jast._src.search.result import SearchResult
-from jast._src.util.checks import whole_number
+from jast._src.util.checks import instance, whole_number
 from jast._src.util.leaf_names import named_numbers
 from jast._src.util.pytrees import index_tree
 from jast.estimate import FailureSamples
@@ -79,11 +79,7 @@ def samples_of(caller: str, samples: Any, sim: Any, modes: Any, most: int) -> Sa
         sim = samples.sim if sim is None else sim
         modes = samples.modes if modes is None else modes
         samples = samples.failures
-    if not isinstance(sim, Simulator):
-        raise ValueError(
-            f"plot.{caller}: sim must be the jast.Simulator of the episodes, received"
-            f" {type(sim).__name__}"
-        )
+    instance(f"plot.{caller}", "sim", sim, Simulator, "the jast.Simulator of the episodes")
     if isinstance(samples, Mode):
         samples = Modes([samples])
     if isinstance(samples, Modes) and len(samples):
@@ -112,10 +108,8 @@ def samples_of(caller: str, samples: Any, sim: Any, modes: Any, most: int) -> Sa
         return Samples(few, sim, owners(sim, few._replace(states=None), likeliest))
     numbers = np.asarray(modes)
     if numbers.shape != (n,) or numbers.dtype.kind not in "iu" or numbers.min() < 0:
-        raise ValueError(
-            f"plot.{caller}: modes must be jast.search.Modes, or the number of its mode from 0 for"
-            f" each of {n} episodes, received {modes!r}"
-        )
+        must = f"be jast.search.Modes, or the number of its mode from 0 for each of {n} episodes"
+        raise style.wrong(caller, "modes", must, f"{modes!r}")
     return Samples(few, sim, numbers[rows])
 
 
@@ -200,10 +194,8 @@ def nominal_series(caller: str, sim: Simulator, nominal: Any) -> Series | None:
         return series_of(sim, samples_of(caller, nominal, sim, None, DRAWS).episodes)
     count = (0 if runs_on_host(sim) else DRAWS) if nominal is None else nominal
     if isinstance(count, bool) or not isinstance(count, int) or count < 0:
-        raise ValueError(
-            f"plot.{caller}: nominal must be Episodes with one leading axis, or how many to draw,"
-            f" received {nominal!r}"
-        )
+        must = "be Episodes with one leading axis, or how many to draw"
+        raise style.wrong(caller, "nominal", must, f"{nominal!r}")
     if not count:
         return None
     keys = jax.random.split(jax.random.key(0), count)
@@ -239,9 +231,7 @@ def choose_fields(
         parts = [k for k in of.columns if k.startswith((f"{name}[", f"{name}."))]
         these = [name] if name in of.columns else parts
         if not these:
-            raise ValueError(
-                f"plot.{caller}: fields must be among {list(of.columns)}, received {name!r}"
-            )
+            raise style.wrong(caller, "fields", f"be among {list(of.columns)}", f"{name!r}")
         found += these
     if not found:
         raise ValueError(f"plot.{caller}: fields must name a field, received {names!r}")

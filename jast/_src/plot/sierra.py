@@ -47,9 +47,7 @@ def sierra(
     except (TypeError, ValueError):
         pairs = []
     if not pairs:
-        raise ValueError(
-            f"plot.sierra: settings must be pairs (sharpness, decay), received {settings!r}"
-        )
+        raise style.wrong("sierra", "settings", "be pairs (sharpness, decay)", f"{settings!r}")
     line = np.linspace(-SIDE, SIDE, POINTS)
     plane = jnp.asarray(np.stack(np.meshgrid(line, line), -1).reshape(-1, 2))
     columns = min(3, len(pairs))

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, NewType
 import numpy as np
 
 from jast._src.core.episode import Episode, replay
+from jast._src.util import checks
 
 if TYPE_CHECKING:
     from matplotlib.animation import FuncAnimation
@@ -63,6 +64,7 @@ __all__ = [
     "styled",
     "unframed",
     "whole_steps",
+    "wrong",
 ]
 
 BLUE, VERMILION, GREEN, PURPLE, ORANGE, SKY = COLOURS = (
@@ -125,10 +127,7 @@ def panels(caller, given, size, count, each, columns=1, **settings):
     with axes(given, size, -(-count // columns), columns, **settings) as drawn:
         drawn = np.atleast_1d(np.asarray(drawn, object)).ravel().tolist()
         if len(drawn) < count:
-            raise ValueError(
-                f"plot.{caller}: axes must be at least {count}, one for each {each}, received"
-                f" {len(drawn)}"
-            )
+            raise wrong(caller, "axes", f"be at least {count}, one for each {each}", len(drawn))
         for spare in drawn[count:] if given is None else ():
             spare.set_axis_off()
         yield drawn[:count]
@@ -182,20 +181,21 @@ def states_of(caller, episode, sim, system, kind):
     states = one_episode(caller, episode).states
     states = replay(sim, episode).states if states is None else states
     if not isinstance(states, kind):
-        raise ValueError(
-            f"plot.{caller}: episode must be of jast.simulators.{system}, received states of"
-            f" {type(states).__name__}"
-        )
+        must = f"be of jast.simulators.{system}"
+        raise wrong(caller, "episode", must, f"states of {type(states).__name__}")
     return states
+
+
+def wrong(caller, name, must, received):
+    """The ValueError of `plot.caller` whose argument ``name`` must be something else."""
+    return checks.wrong(f"plot.{caller}", name, must, received)
 
 
 def checked_kind(caller, name, value, kind, words):
     """``value``, the argument ``name``, or a ValueError where it is no ``kind``; ``words`` say what
     it must be.
     """
-    if not isinstance(value, kind):
-        raise ValueError(f"plot.{caller}: {name} must be {words}, received {type(value).__name__}")
-    return value
+    return checks.instance(f"plot.{caller}", name, value, kind, words)
 
 
 def checked_kinds(caller, name, values, kind, words):
@@ -328,8 +328,6 @@ def checked_writable(caller, path):
 
     able = [suffix for suffix, writer in WRITERS.items() if writers.is_available(writer)]
     if path is not None and Path(path).suffix.lower() not in able:
-        raise ValueError(
-            f"plot.{caller}: path must end in one of {able}, which can be written here, received"
-            f" {str(path)!r}"
-        )
+        must = f"end in one of {able}, which can be written here"
+        raise wrong(caller, "path", must, f"{str(path)!r}")
     return None if path is None else Path(path)

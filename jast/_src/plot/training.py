@@ -75,9 +75,7 @@ def levels(proposals: FailureProposal | dict[str, FailureProposal], ax: Axes | N
         for i, (name, found) in enumerate(proposals.items()):
             reached = np.asarray(found.levels, float)
             if reached.ndim != 1:
-                raise ValueError(
-                    f"plot.levels: proposals must be one run each, received {reached.shape[:-1]}"
-                )
+                raise style.wrong("levels", "proposals", "be one run each", reached.shape[:-1])
             at = np.arange(1, len(reached) + 1)
             look = dict(color=style.colour(i), marker=style.marker(i))
             ax.plot(at, np.where(np.isfinite(reached), reached, np.nan), label=name, **look)

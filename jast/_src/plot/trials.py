@@ -15,6 +15,7 @@ import numpy as np
 from jast._src.plot import style
 from jast._src.plot.style import Axes
 from jast._src.search.result import SearchResult
+from jast._src.util.checks import one_of
 
 __all__ = ["trial_distances", "trials"]
 
@@ -163,18 +164,15 @@ def trial_distances(
 
 def _printed(caller, mode):
     """Whether the picture is the thesis's; ValueError for another mode."""
-    if mode not in ("default", "thesis"):
-        raise ValueError(f'plot.{caller}: mode must be "default" or "thesis", received {mode!r}')
+    one_of(f"plot.{caller}", "mode", mode, ("default", "thesis"))
     return mode == "thesis"
 
 
 def _named(caller, results):
     results = style.by_name(results)
     if not results:
-        raise ValueError(
-            f"plot.{caller}: results must be a search result, or a dict of name -> result, received"
-            " an empty dict"
-        )
+        must = "be a search result, or a dict of name -> result"
+        raise style.wrong(caller, "results", must, "an empty dict")
     return results
 
 
@@ -182,17 +180,13 @@ def _columns(caller, result):
     """Distance, log p, failure and whether the episode counts, [n, trees] each."""
     found = getattr(result, "trials", None)
     if found is None:
-        raise ValueError(
-            f"plot.{caller}: results must be of searches with record=True, received a"
-            f" {type(result).__name__} without trials"
-        )
+        must = "be of searches with record=True"
+        raise style.wrong(caller, "results", must, f"a {type(result).__name__} without trials")
     distance, log_p = np.asarray(found.distance, float), np.asarray(found.log_prob, float)
     failure = np.asarray(found.failure, bool)
     if distance.ndim != 2 or not distance.size:
-        raise ValueError(
-            f"plot.{caller}: trials must be arrays [n, trees], received distances of shape"
-            f" {distance.shape}"
-        )
+        must = "be arrays [n, trees]"
+        raise style.wrong(caller, "trials", must, f"distances of shape {distance.shape}")
     return distance, log_p, failure, np.isfinite(distance) & np.asarray(found.ran, bool)
 
 

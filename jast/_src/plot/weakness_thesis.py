@@ -15,7 +15,7 @@ from jast._src.core.typing import Array
 from jast._src.plot import style
 from jast._src.plot.style import Axes
 from jast._src.plot.weakness import checked_result
-from jast._src.util.checks import number, whole_number
+from jast._src.util.checks import number, one_of, whole_number
 from jast._src.weakness.encoded import Encoded
 from jast._src.weakness.measures import checked_truth, precision_recall
 from jast._src.weakness.result import Result
@@ -152,13 +152,10 @@ def likely_failures(
     networks = _networks(caller, networks)
     inputs, n = np.asarray(inputs), len(networks.scores)
     if inputs.shape != (n, *networks.shape) or inputs.ndim != 3:
-        raise ValueError(
-            f"plot.{caller}: inputs must be the images of the validation, {[n, *networks.shape]},"
-            f" received shape {inputs.shape}"
-        )
+        must = f"be the images of the validation, {[n, *networks.shape]}"
+        raise style.wrong(caller, "inputs", must, f"shape {inputs.shape}")
     failed = checked_truth(f"plot.{caller}", failed, n)
-    if kind not in KINDS:
-        raise ValueError(f"plot.{caller}: kind must be one of {list(KINDS)}, received {kind!r}")
+    one_of(f"plot.{caller}", "kind", kind, KINDS)
     suspect = networks.scores >= 0.5
     of_kind = {"true positives": failed & suspect, "false negatives": failed & ~suspect}
     there = of_kind.get(kind, np.ones(n, bool))
@@ -210,10 +207,8 @@ def pixel_likelihood(networks: Encoded, ax: Axes | None = None) -> Axes:
     """
     networks = _networks("pixel_likelihood", networks)
     if len(networks.shape) != 2:
-        raise ValueError(
-            "plot.pixel_likelihood: networks must be of images [height, width], received inputs of"
-            f" shape {networks.shape}"
-        )
+        must = "be of images [height, width]"
+        raise style.wrong("pixel_likelihood", "networks", must, f"inputs of shape {networks.shape}")
     scores = networks.score(np.eye(int(np.prod(networks.shape)))).reshape(networks.shape)
     with style.axes(ax, (4.9, 4.1)) as ax:
         shown = ax.imshow(scores, cmap="cividis", interpolation="nearest")

@@ -42,12 +42,8 @@ more.
 LOG_2PI = math.log(2 * math.pi)
 
 
-def log_normal(
-    z: jax.Array, mean: jax.Array | None = None, deviation: jax.Array | None = None
-) -> jax.Array:
-    """log N(z; mean, deviation^2) [] of ``z`` [n]; of N(0, I) where no mean is given."""
-    if mean is None:
-        return -0.5 * jnp.sum(z**2 + LOG_2PI)
+def log_normal(z: jax.Array, mean: jax.Array, deviation: jax.Array) -> jax.Array:
+    """log N(z; mean, deviation^2) [] of ``z`` [n]."""
     return -0.5 * jnp.sum(((z - mean) / deviation) ** 2 + LOG_2PI) - jnp.sum(jnp.log(deviation))
 
 

@@ -20,7 +20,7 @@ from jast._src.policies.settings import Asked, is_auto
 from jast._src.policies.train_policy import Method, train_policy
 from jast._src.policies.training_state import explore
 from jast._src.runtime.memory import require
-from jast._src.util.checks import whole_number
+from jast._src.util.checks import whole_number, wrong
 
 __all__ = ["q_learning"]
 
@@ -149,10 +149,8 @@ def _ranges(ranges: Any, m: int) -> np.ndarray | None:
     except (TypeError, ValueError):
         good = False
     if not good:
-        raise ValueError(
-            f'q_learning: ranges must be "auto" or [{m}, 2], the least and the greatest of each'
-            f" number observed, received {ranges!r}"
-        )
+        must = f'be "auto" or [{m}, 2], the least and the greatest of each number observed'
+        raise wrong("q_learning", "ranges", must, f"{ranges!r}")
     return known
 
 
@@ -166,15 +164,11 @@ def _cells(
             whole_number("q_learning", "cells", c) for c in (cells if several else [cells] * m)
         )
         if len(each) != m:
-            raise ValueError(
-                f"q_learning: cells must be a whole number or {m} of them, one for each number"
-                f" observed, received {cells!r}"
-            )
+            must = f"be a whole number or {m} of them, one for each number observed"
+            raise wrong("q_learning", "cells", must, f"{cells!r}")
         return q_learning_training.grid_cell(each), horizon * math.prod(each)
     cells = whole_number("q_learning", "cells", cells)
     like = jax.eval_shape(cell, *(jax.ShapeDtypeStruct(*s) for s in (((m,), "f4"), ((), "i4"))))
     if not (getattr(like, "shape", None) == () and jnp.issubdtype(like.dtype, np.integer)):
-        raise ValueError(
-            f"q_learning: cell must return one whole number, the number of a cell, received {like}"
-        )
+        raise wrong("q_learning", "cell", "return one whole number, the number of a cell", like)
     return q_learning_training.user_cell(cell, cells), cells

@@ -11,7 +11,7 @@ from jast._src.policies.actor import count_latents
 from jast._src.policies.training_state import Config
 from jast._src.runtime._jax import is_traced
 from jast._src.runtime.host_errors import runs_on_host
-from jast._src.util.checks import check_random_key, real_number, whole_number
+from jast._src.util.checks import check_random_key, real_number, whole_number, wrong
 
 __all__ = ["Asked", "Plan", "is_auto"]
 
@@ -82,10 +82,8 @@ class Asked:
         ``multiple`` of steps.
         """
         if episodes < LEAST_EPISODES * lanes:
-            raise ValueError(
-                f"{self.function}: episodes must be at least {LEAST_EPISODES} for each lane,"
-                f" {LEAST_EPISODES * lanes}, received {episodes}"
-            )
+            must = f"be at least {LEAST_EPISODES} for each lane, {LEAST_EPISODES * lanes}"
+            raise wrong(self.function, "episodes", must, episodes)
         horizon = self.sim.horizon
         steps = -(-episodes * horizon // lanes)
         nominal, exploration = (
@@ -97,14 +95,10 @@ class Asked:
     def networks(self, hidden: Any, shaping: Any, **others: int) -> Config:
         """The `Config` of a learner of networks with the widths ``hidden``."""
         if not isinstance(hidden, tuple | list) or not hidden:
-            raise ValueError(
-                f"{self.function}: hidden must be the widths of one or more layers, received"
-                f" {hidden!r}"
-            )
+            must = "be the widths of one or more layers"
+            raise wrong(self.function, "hidden", must, f"{hidden!r}")
         if shaping not in ("auto", "steps", "end"):
-            raise ValueError(
-                f'{self.function}: shaping must be "auto", "steps" or "end", received {shaping!r}'
-            )
+            raise wrong(self.function, "shaping", 'be "auto", "steps" or "end"', f"{shaping!r}")
         hidden = tuple(whole_number(self.function, "hidden", width) for width in hidden)
         auto = shaping == "auto" and not (self.sim.episodic and runs_on_host(self.sim))
         dense_reward = auto or shaping == "steps"

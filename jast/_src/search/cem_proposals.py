@@ -14,6 +14,7 @@ from jast._src.core.signature import signature_of
 from jast._src.core.simulator import Simulator
 from jast._src.normal_space.sequences import disturbance_at
 from jast._src.normal_space.transform import latents
+from jast._src.util.checks import instance
 from jast._src.util.pytrees import index_tree, select
 
 __all__ = ["latents_around", "copy_steps", "make_draw", "proposal_kinds"]
@@ -69,14 +70,9 @@ def latents_around(sim, actions, failures, settings):
     """
     if settings is None:
         raise ValueError("cem: failures must be None inside of jax.jit and jax.vmap")
-    if not isinstance(failures, Failures):
-        kind = type(failures).__name__
-        raise ValueError(f"cem: failures must be an archive (result.failures), received {kind}")
-    if not isinstance(actions, choices.Wide | choices.Quantiles):
-        kind = type(actions).__name__
-        raise ValueError(
-            f"cem: actions must be quantiles() or wide() where failures are given, received {kind}"
-        )
+    instance("cem", "failures", failures, Failures, "an archive (result.failures)")
+    words = "quantiles() or wide() where failures are given"
+    instance("cem", "actions", actions, choices.Wide | choices.Quantiles, words)
     if not len(failures):
         return ()
     one = jax.tree.map(lambda a: jnp.asarray(a)[None], failures.best._replace(states=None))

@@ -30,6 +30,7 @@ from jast._src.search.lanes import Tally, distinct_episodes, in_blocks, play_dra
 from jast._src.search.refine.final import default_share, with_refine_share
 from jast._src.search.result import SearchResult, Trials
 from jast._src.search.setup import prepare
+from jast._src.util.checks import wrong
 from jast._src.util.pytrees import index_tree, map_in_lanes, select
 
 __all__ = ["monte_carlo"]
@@ -137,10 +138,8 @@ def monte_carlo(
     if settings is None:
         work.require_untraced(name, checkpoint=checkpoint, executor=executor, devices=devices)
         if episodes * sim.horizon >= 2**31:
-            raise ValueError(
-                f"{name}: episodes times the horizon must be below 2^31 inside a"
-                f" transformation, received {episodes} x {sim.horizon}"
-            )
+            must = "be below 2^31 inside a transformation"
+            raise wrong(name, "episodes times the horizon", must, f"{episodes} x {sim.horizon}")
         found, tally = _chunk(*parts, _nothing(sim, 1), 0, episodes, lanes)
         best = index_tree(_rebuild(*parts, found.number[None]), 0)
         return finish_traced(sim, reward, tally, best, found.reward[None])

@@ -38,7 +38,7 @@ import numpy as np
 
 from jast._src.core.simulator import Simulator
 from jast._src.core.typing import Array
-from jast._src.util.checks import real_number, whole_number
+from jast._src.util.checks import real_number, whole_number, wrong
 from jast.blackbox import from_python
 from jast.distributions import Independent, Normal
 
@@ -157,10 +157,8 @@ def bluesky_flight(disturbances: Array) -> Flight:
     """
     x = np.asarray(disturbances, np.float64)
     if x.ndim != 2 or x.shape[1] != 4 or not len(x) or not np.isfinite(x).all():
-        raise ValueError(
-            "bluesky_flight: disturbances must be finite and [waypoints, 4], received shape"
-            f" {x.shape}"
-        )
+        must = "be finite and [waypoints, 4]"
+        raise wrong("bluesky_flight", "disturbances", must, f"shape {x.shape}")
     _installed()
     with ONE:
         return judged(*fly(x))

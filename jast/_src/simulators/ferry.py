@@ -18,6 +18,7 @@ import jax.numpy as jnp
 from jax.tree_util import Partial
 
 from jast._src.core.simulator import Simulator
+from jast._src.util.checks import one_of
 from jast.distributions import Uniform, tent, where
 
 __all__ = ["COLLISION", "FerryState", "ferry"]
@@ -66,10 +67,7 @@ def ferry(
         >>> bool(jast.replay(sim, jnp.full(21, 0.5)).failure)  # straight on
         False
     """
-    if observation not in OBSERVATIONS:
-        raise ValueError(
-            f"ferry: observation must be one of {list(OBSERVATIONS)}, received {observation!r}"
-        )
+    one_of("ferry", "observation", observation, OBSERVATIONS)
     try:
         start = jnp.asarray(adversary)
     except (TypeError, ValueError):

@@ -17,6 +17,7 @@ from jax.tree_util import Partial
 
 from jast._src.core.simulator import Simulator
 from jast._src.core.typing import Array
+from jast._src.util.checks import wrong
 from jast._src.util.pytrees import as_partial
 from jast.distributions import MultivariateNormalDiag
 
@@ -45,9 +46,7 @@ def limit_state(g: Callable[[Any], Array], dimension: int) -> Simulator:
         True
     """
     if isinstance(dimension, bool) or not isinstance(dimension, int) or dimension < 1:
-        raise ValueError(
-            f"limit_state: dimension must be an int of at least 1, received {dimension!r}"
-        )
+        raise wrong("limit_state", "dimension", "be an int of at least 1", f"{dimension!r}")
     if not callable(g):
         raise ValueError(f"limit_state: g must be a function, received {g!r}")
     g = as_partial(g)

@@ -18,6 +18,7 @@ from jast._src.simulators.colav.system import ColavState
 from jast._src.simulators.ferry import COLLISION, FerryState
 from jast._src.simulators.pendulum import PendulumState
 from jast._src.simulators.svg import BLUE, GREEN, GREY, INK, VERMILION
+from jast._src.util.checks import wrong
 
 __all__ = ["DRAWN", "draw"]
 
@@ -48,10 +49,8 @@ def draw(state: ArrayTree, past: ArrayTree | None = None) -> str:
     for kind, picture in DRAWN.items():
         if isinstance(state, kind):
             return picture(state, past)
-    raise ValueError(
-        f"draw: state must be one of {[kind.__name__ for kind in DRAWN]}, received a"
-        f" {type(state).__name__}"
-    )
+    must = f"be one of {[kind.__name__ for kind in DRAWN]}"
+    raise wrong("draw", "state", must, f"a {type(state).__name__}")
 
 
 def _ferry(s: FerryState, past: FerryState | None) -> str:

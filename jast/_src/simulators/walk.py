@@ -16,6 +16,7 @@ from jax.tree_util import Partial
 from jast._src.core.simulator import Simulator
 from jast._src.core.typing import Numeric
 from jast._src.simulators.parameter import positive
+from jast._src.util.checks import one_of
 from jast.distributions import Normal
 
 __all__ = ["walk1d"]
@@ -47,8 +48,7 @@ def walk1d(
         >>> bool(jast.replay(jast.simulators.walk1d(), jnp.ones(30)).failure)
         True
     """
-    if form not in HORIZON:
-        raise ValueError(f'walk1d: form must be "two-sided" or "one-sided", received {form!r}')
+    one_of("walk1d", "form", form, HORIZON)
     sigma, threshold = positive("walk1d", sigma=sigma, threshold=threshold)
     evaluate = Partial(_two_sided if form == "two-sided" else _one_sided, threshold)
     return Simulator(

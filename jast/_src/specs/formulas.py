@@ -14,6 +14,7 @@ from typing import Any
 
 import jax
 
+from jast._src.util.checks import wrong
 from jast._src.util.pytrees import as_partial
 
 __all__ = [
@@ -317,10 +318,8 @@ def _in_brackets(f: Formula) -> str:
 def checked_formula(function: str, name: str, f: Any) -> Formula:
     """``f``. ValueError unless it is a formula."""
     if not isinstance(f, Formula):
-        raise ValueError(
-            f"{function}: {name} must be a formula, as jast.specs.predicate(function) makes it,"
-            f" received {f!r}"
-        )
+        must = "be a formula, as jast.specs.predicate(function) makes it"
+        raise wrong(function, name, must, f"{f!r}")
     return f
 
 
@@ -328,8 +327,6 @@ def _checked_window(function: str, f: Formula, a: Any, b: Any) -> tuple[float, f
     ends = [a] if b is None else [a, b]
     numbers = all(isinstance(v, Real) and not isinstance(v, bool) for v in ends)
     if not (numbers and all(map(math.isfinite, ends)) and 0 <= a <= ends[-1]):
-        raise ValueError(
-            f"{function} {_in_brackets(f)}: the window must be two numbers of seconds, 0 <= a <= b"
-            f" (b may be left out: to the trace's end), received a={a!r}, b={b!r}"
-        )
+        must = "be two numbers of seconds, 0 <= a <= b (b may be left out: to the trace's end)"
+        raise wrong(f"{function} {_in_brackets(f)}", "the window", must, f"a={a!r}, b={b!r}")
     return float(a), None if b is None else float(b)

@@ -32,7 +32,7 @@ from jast._src.specs.formulas import (
     children,
     predicates,
 )
-from jast._src.util.checks import number, real_number
+from jast._src.util.checks import number, real_number, wrong
 
 __all__ = ["Values", "fits", "margins", "reach", "robustness", "samples_in", "spacing", "values"]
 
@@ -231,10 +231,8 @@ def spacing(function: str, dt: Any) -> float:
 def _length(trace: Any) -> int:
     lengths = {jnp.shape(a)[0] if jnp.ndim(a) else -1 for a in jax.tree.leaves(trace)}
     if len(lengths) != 1 or min(lengths) < 1:
-        raise ValueError(
-            "robustness: trace must be arrays [T, ...] with one T of at least 1, received"
-            f" {jax.tree.map(jnp.shape, trace)}"
-        )
+        must = "be arrays [T, ...] with one T of at least 1"
+        raise wrong("robustness", "trace", must, jax.tree.map(jnp.shape, trace))
     return lengths.pop()
 
 

@@ -17,6 +17,7 @@ from jast._src.core.simulator import Simulator
 from jast._src.specs import monitor
 from jast._src.specs.formulas import Formula, checked_formula, predicates
 from jast._src.specs.robustness import fits, margins, spacing
+from jast._src.util.checks import wrong
 from jast._src.util.pytrees import as_partial, index_tree
 
 __all__ = ["Monitored", "goes_on", "trace_of", "under"]
@@ -122,10 +123,8 @@ def under(
     rows = jax.eval_shape(partial(_samples_of, samples), state)
     sizes = {a.shape[0] if a.ndim else 0 for a in jax.tree.leaves(rows)}
     if len(sizes) != 1 or 0 in sizes:
-        raise ValueError(
-            "under: samples must return arrays [k, ...] with one k of at least 1, received"
-            f" {jax.tree.map(lambda a: a.shape, rows)}"
-        )
+        must = "return arrays [k, ...] with one k of at least 1"
+        raise wrong("under", "samples", must, jax.tree.map(lambda a: a.shape, rows))
     total = sim.horizon * sizes.pop() + 1
     fits("under", formula, total, dt)
     watch = _Watch(sim=sim, formula=formula, samples=samples, dt=dt, total=total)

@@ -18,7 +18,7 @@ from jast._src.sweeping.curve import join_rows
 from jast._src.sweeping.rows import Rows, options_of, run_here, run_in_executor
 from jast._src.sweeping.simulators import count_kinds, make_simulators
 from jast._src.sweeping.table import Sweep
-from jast._src.util.checks import check_random_key
+from jast._src.util.checks import check_random_key, wrong
 from jast._src.util.display import call_settings
 from jast.estimate import failure_probability
 
@@ -171,9 +171,7 @@ def _check_arguments(name, called, args, named):
         signature.bind(*args, **named)
     except TypeError as error:
         what = ", ".join([*args, *map(repr, named)])
-        raise ValueError(
-            f"sweep: {name} must take {what}, received {_name(called)}: {error}"
-        ) from error
+        raise wrong("sweep", name, f"take {what}", f"{_name(called)}: {error}") from error
 
 
 def _join(function, rows, found):
@@ -189,10 +187,8 @@ def _join(function, rows, found):
 def _rows(values):
     """(name -> tuple of N values, N dicts of name -> value), of Python's own numbers."""
     if not isinstance(values, Mapping) or not values:
-        raise ValueError(
-            'sweep: values must be a dict of name -> values, such as {"gain": [0.1, 0.2]}, received'
-            f" {values!r:.80}"
-        )
+        must = 'be a dict of name -> values, such as {"gain": [0.1, 0.2]}'
+        raise wrong("sweep", "values", must, f"{values!r:.80}")
     columns = {}
     for name, given in values.items():
         if not isinstance(name, str):
@@ -203,9 +199,7 @@ def _rows(values):
         columns[name] = tuple(v.item() if _scalar(v) else v for v in given)
     sizes = {name: len(column) for name, column in columns.items()}
     if len(set(sizes.values())) > 1 or not all(sizes.values()):
-        raise ValueError(
-            f"sweep: values must be equally many for each setting, at least 1, received {sizes}"
-        )
+        raise wrong("sweep", "values", "be equally many for each setting, at least 1", sizes)
     return columns, [dict(zip(columns, row)) for row in zip(*columns.values(), strict=True)]
 
 
@@ -217,14 +211,10 @@ def _checked(simulators, n):
     if callable(simulators):
         return simulators
     if isinstance(simulators, Simulator) or not isinstance(simulators, Sequence):
-        raise ValueError(
-            "sweep: simulators must be a function of the settings that returns a jast.Simulator, or"
-            f" one for each value, received {type(simulators).__name__}"
-        )
+        must = "be a function of the settings that returns a jast.Simulator, or one for each value"
+        raise wrong("sweep", "simulators", must, type(simulators).__name__)
     if len(simulators) != n:
-        raise ValueError(
-            f"sweep: simulators must be {n}, one for each value, received {len(simulators)}"
-        )
+        raise wrong("sweep", "simulators", f"be {n}, one for each value", len(simulators))
     return simulators
 
 

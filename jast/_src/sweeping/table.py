@@ -14,6 +14,7 @@ from jast._src.core.nominal import Nominal
 from jast._src.estimate.estimate import guaranteed_words, is_doubtful
 from jast._src.io.data_frames import dataframe
 from jast._src.util import display
+from jast._src.util.checks import wrong
 from jast._src.util.intervals import checked_level
 from jast.estimate import Estimate
 from jast.search import SearchResult
@@ -224,10 +225,8 @@ class Sweep(NamedTuple):
         varying = [k for k, v in numeric.items() if len(set(v)) > 1]
         name = varying[0] if against is None and len(varying) == 1 else against
         if name not in numeric:
-            raise ValueError(
-                f"{caller}: against must name a setting of numbers, one of {list(numeric)},"
-                f" received {against!r}"
-            )
+            must = f"name a setting of numbers, one of {list(numeric)}"
+            raise wrong(caller, "against", must, f"{against!r}")
         return name, numeric[name]
 
     def __str__(self) -> str:

@@ -5,7 +5,8 @@ expected and what came.
 import importlib
 import operator
 import os
-from typing import Any
+from collections.abc import Collection
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -18,10 +19,42 @@ __all__ = [
     "check_path",
     "check_random_key",
     "import_library",
+    "instance",
     "number",
+    "one_of",
     "real_number",
+    "truth_value",
     "whole_number",
+    "wrong",
 ]
+
+
+Kind = TypeVar("Kind")
+
+
+def wrong(function: str, name: str, must: str, received: object) -> ValueError:
+    """The error of a ``function`` whose setting ``name`` must be, hold or do something else."""
+    return ValueError(f"{function}: {name} must {must}, received {received}")
+
+
+def one_of(function: str, name: str, value: Any, allowed: Collection[Any]) -> None:
+    """ValueError unless ``value`` is one of those ``allowed``."""
+    if value not in list(allowed):
+        raise wrong(function, name, f"be one of {list(allowed)}", f"{value!r}")
+
+
+def truth_value(function: str, **named: Any) -> None:
+    """ValueError unless each is True or False."""
+    for name, value in named.items():
+        if not isinstance(value, bool):
+            raise wrong(function, name, "be True or False", f"{value!r}")
+
+
+def instance(function: str, name: str, value: Any, kind: type[Kind], words: str) -> Kind:
+    """``value``, or a ValueError where it is no ``kind``; ``words`` say what it must be."""
+    if not isinstance(value, kind):
+        raise wrong(function, name, f"be {words}", type(value).__name__)
+    return value
 
 
 def import_library(function: str, module: str, extra: str) -> Any:
@@ -41,9 +74,7 @@ def check_random_key(function: str, key: Any) -> None:
     if not (typed or raw):
         received = f"{type(key).__name__} {key!r}" if dtype is None else f"{dtype}{list(shape)}"
         hint = f": jax.random.key({key})" if type(key) is int else ""
-        raise ValueError(
-            f"{function}: key must be a jax.random.key{hint}, received {received[:80]}"
-        )
+        raise wrong(function, "key", f"be a jax.random.key{hint}", received[:80])
 
 
 def check_numbers(function: str, **named: Any) -> None:

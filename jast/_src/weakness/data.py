@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from jast._src.core.typing import PathLike
-from jast._src.util.checks import check_path, import_library, whole_number
+from jast._src.util.checks import check_path, import_library, instance, whole_number, wrong
 from jast._src.weakness.result import Result
 
 __all__ = [
@@ -74,10 +74,8 @@ def check_data(function, inputs, labels, classes=None):
     """
     inputs, labels = np.asarray(inputs), np.asarray(labels)
     if inputs.ndim < 2 or inputs.dtype.kind not in "fiub" or inputs.size == 0:
-        raise ValueError(
-            f"{function}: inputs must be numbers [n, ...], n inputs of one shape, received"
-            f" {inputs.dtype} of shape {inputs.shape}"
-        )
+        must = "be numbers [n, ...], n inputs of one shape"
+        raise wrong(function, "inputs", must, f"{inputs.dtype} of shape {inputs.shape}")
     if inputs.dtype.kind == "f":
         bad = np.flatnonzero(~np.isfinite(inputs).reshape(len(inputs), -1).all(1))
         if len(bad):
@@ -86,18 +84,14 @@ def check_data(function, inputs, labels, classes=None):
                 f" infinity, the first is number {bad[0]}"
             )
     if max(abs(float(inputs.max())), abs(float(inputs.min()))) > LARGEST:
-        raise ValueError(
-            f"{function}: inputs must lie within {LARGEST:g} of 0, received {inputs.min()} to"
-            f" {inputs.max()}"
-        )
+        must = f"lie within {LARGEST:g} of 0"
+        raise wrong(function, "inputs", must, f"{inputs.min()} to {inputs.max()}")
     if labels.shape != (len(inputs),) or labels.dtype.kind not in "iub":
         hint = ""
         if labels.dtype.kind not in "iub":
             hint = "; np.unique(labels, return_inverse=True)[1] makes such numbers"
-        raise ValueError(
-            f"{function}: labels must be whole numbers [{len(inputs)}], one for each input,"
-            f" received {labels.dtype} of shape {labels.shape}{hint}"
-        )
+        must = f"be whole numbers [{len(inputs)}], one for each input"
+        raise wrong(function, "labels", must, f"{labels.dtype} of shape {labels.shape}{hint}")
     classes = max(int(labels.max()) + 1, 2) if classes is None else classes
     classes = whole_number(function, "classes", classes, 2)
     if classes > MOST_CLASSES:
@@ -121,8 +115,7 @@ def are_indices(at, n):
 
 def data_of_result(function, result, inputs, labels, classes=None):
     """The `Data` of a ``result``; ValueError for other inputs or labels than its own."""
-    if not isinstance(result, Result):
-        raise ValueError(f"{function}: result must be a Result, received {type(result).__name__}")
+    instance(function, "result", result, Result, "a Result")
     if classes is None and np.size(labels) and np.asarray(labels).dtype.kind in "iub":
         classes = max(2, int(np.max(result.predicted)) + 1, int(np.max(labels)) + 1)
     data = check_data(function, inputs, labels, classes)
@@ -169,10 +162,8 @@ def idx(path: PathLike) -> np.ndarray:
             f" dimensions; it starts with {raw[:4]!r}"
         )
     if raw[2] not in TYPES:
-        raise ValueError(
-            f"idx: {path} must have a type of {', '.join(f'0x{t:02X}' for t in TYPES)}, received"
-            f" 0x{raw[2]:02X}"
-        )
+        must = f"have a type of {', '.join(f'0x{t:02X}' for t in TYPES)}"
+        raise wrong("idx", path, must, f"0x{raw[2]:02X}")
     start = 4 + 4 * raw[3]
     if len(raw) < start:
         raise ValueError(
@@ -257,9 +248,7 @@ def _content(path):
     try:
         return gzip.decompress(raw)
     except (OSError, EOFError, zlib.error) as error:
-        raise ValueError(
-            f"idx: {path} must be a whole gzip file, received one that is damaged: {error}"
-        ) from error
+        raise wrong("idx", path, "be a whole gzip file", f"one that is damaged: {error}") from error
 
 
 def _named(folder, stem, ending, dims):
@@ -273,8 +262,6 @@ def _named(folder, stem, ending, dims):
         )
     array = idx(found)
     if array.dtype != np.uint8 or array.ndim != dims:
-        raise ValueError(
-            f"from_idx: {found} must hold unsigned bytes in {dims} dimensions, received"
-            f" {array.dtype} of shape {array.shape}"
-        )
+        must = f"hold unsigned bytes in {dims} dimensions"
+        raise wrong("from_idx", found, must, f"{array.dtype} of shape {array.shape}")
     return array

@@ -10,7 +10,7 @@ import numpy as np
 
 from jast._src.core.counter_prng import numpy_generator
 from jast._src.core.typing import Array, PRNGKey
-from jast._src.util.checks import check_random_key
+from jast._src.util.checks import check_random_key, wrong
 from jast._src.weakness import committee
 from jast._src.weakness.data import are_indices, data_of_result
 from jast._src.weakness.default_selector import PASSES, STRENGTH
@@ -63,9 +63,7 @@ def influence(
     data = data_of_result("influence", result, inputs, labels, classes)
     at = np.asarray(result.failures if at is None else at)
     if at.ndim != 1 or not are_indices(at, data.size):
-        raise ValueError(
-            f"influence: at must be indices [k] in 0 ... {data.size - 1}, received {at!r}"
-        )
+        raise wrong("influence", "at", f"be indices [k] in 0 ... {data.size - 1}", f"{at!r}")
     at = at.astype(int)
     tried = result.predicted >= 0
     answers = np.where(tried, result.predicted, data.labels)

@@ -10,7 +10,7 @@ import numpy as np
 
 from jast._src.core.typing import Array
 from jast._src.util import display
-from jast._src.util.checks import number, whole_number
+from jast._src.util.checks import instance, number, whole_number, wrong
 from jast._src.weakness.result import Result
 
 __all__ = ["Judgement", "Roc", "auc", "checked_truth", "judge", "precision_recall", "roc"]
@@ -159,8 +159,7 @@ def judge(
         >>> told.candidates.tolist() == [20] * len(told.auc)
         True
     """
-    if not isinstance(result, Result):
-        raise ValueError(f"judge: result must be a Result, received {type(result).__name__}")
+    instance("judge", "result", result, Result, "a Result")
     threshold = number(
         "judge", "threshold", threshold, lambda v: not np.isnan(v), "to compare scores with"
     )
@@ -188,9 +187,7 @@ def checked_truth(function, failed, n):
     """``failed`` as an array, or a ValueError unless it is bool [n]."""
     truth = _array(failed)
     if truth.shape != (n,) or truth.dtype != bool:
-        raise ValueError(
-            f"{function}: failed must be bool [{n}], received {truth.dtype} of shape {truth.shape}"
-        )
+        raise wrong(function, "failed", f"be bool [{n}]", f"{truth.dtype} of shape {truth.shape}")
     return truth
 
 

@@ -11,7 +11,7 @@ import jax
 import numpy as np
 
 from jast._src.core.counter_prng import numpy_generator
-from jast._src.util.checks import number, whole_number
+from jast._src.util.checks import number, truth_value, whole_number
 from jast._src.weakness import networks
 from jast._src.weakness.features import require_memory, scale_inputs
 from jast._src.weakness.selector_contract import Selector, Step
@@ -75,8 +75,7 @@ def thesis(
     widths = None if hidden is None else np.atleast_1d(hidden).tolist()
     if widths == []:
         raise ValueError("thesis: hidden must be at least one width, received none")
-    if not isinstance(replacement, bool):
-        raise ValueError(f"thesis: replacement must be True or False, received {replacement!r}")
+    truth_value("thesis", replacement=replacement)
     settings = dict(
         iterations=whole("iterations", iterations),
         sample=whole("sample", sample),

@@ -15,7 +15,7 @@ from jast._src.core.counter_prng import numpy_generator
 from jast._src.core.typing import Array, Callback, PathLike, Predict, PRNGKey
 from jast._src.runtime.checkpoints import open_checkpoint
 from jast._src.runtime.progress_bar import Watch, terminable
-from jast._src.util.checks import check_random_key, whole_number
+from jast._src.util.checks import check_random_key, whole_number, wrong
 from jast._src.weakness import selectors
 from jast._src.weakness.data import are_indices, check_data, fingerprint
 from jast._src.weakness.measures import auc
@@ -99,10 +99,8 @@ def validate(
     chosen = _selector(selector)
     n = data.size
     if not callable(predict):
-        raise ValueError(
-            "validate: predict must be callable: inputs [m, ...] -> labels [m], received"
-            f" {predict!r}"
-        )
+        must = "be callable: inputs [m, ...] -> labels [m]"
+        raise wrong("validate", "predict", must, f"{predict!r}")
     budget = n if budget is None else min(whole_number("validate", "budget", budget), n)
     if state is None:
         check_random_key("validate", key)
@@ -121,10 +119,8 @@ def _selector(selector):
         return selector
     if not isinstance(selector, str) or selector not in selectors.NAMES:
         hint = f": call it, {selector.__name__}()" if selector in selectors.NAMES.values() else ""
-        raise ValueError(
-            f"validate: selector must be one of {sorted(selectors.NAMES)} or a Selector, received"
-            f" {selector!r}{hint}"
-        )
+        must = f"be one of {sorted(selectors.NAMES)} or a Selector"
+        raise wrong("validate", "selector", must, f"{selector!r}{hint}")
     return selectors.NAMES[selector]()
 
 
@@ -161,9 +157,8 @@ def iteration_key(numbers, iteration):
 def _fits(state, data, selector):
     if not isinstance(state, State):
         hint = ": give result.state" if isinstance(state, Result) else ""
-        raise ValueError(
-            f"validate: state must be the state of a Result, received {type(state).__name__}{hint}"
-        )
+        must = "be the state of a Result"
+        raise wrong("validate", "state", must, f"{type(state).__name__}{hint}")
     if state.data != fingerprint(data):
         raise ValueError("validate: state is of other inputs or labels")
     if state.selector != _described(selector):
@@ -201,10 +196,8 @@ def _run(state, selector, data, predict, budget, store, progress, callback):
         nonlocal current
         indices = np.asarray(indices)
         if indices.size and indices.ndim != 1 or not are_indices(indices, data.size):
-            raise ValueError(
-                f"validate: the selector {selector.name} must ask for indices [m] in 0 ..."
-                f" {data.size - 1}, received {indices!r}"
-            )
+            must = f"ask for indices [m] in 0 ... {data.size - 1}"
+            raise wrong("validate", f"the selector {selector.name}", must, f"{indices!r}")
         left = budget - len(current.order)
         new = [i for i in dict.fromkeys(indices.tolist()) if current.predicted[i] < 0][:left]
         fresh = [i for i in new if answers[i] < 0][: budget - len(answered)]
@@ -311,10 +304,8 @@ def _row(history, step, seen):
     outside = ~((scores >= 0) & (scores <= 1))
     if scores.shape != tried.shape or outside.any():
         bad = f", {outside.sum()} elsewhere" if scores.shape == tried.shape else ""
-        raise ValueError(
-            f"validate: the selector's scores must be [{len(tried)}] in [0, 1], received shape"
-            f" {scores.shape}{bad}"
-        )
+        must = f"be [{len(tried)}] in [0, 1]"
+        raise wrong("validate", "the selector's scores", must, f"shape {scores.shape}{bad}")
     ran = np.asarray(step.candidates, int)
     ran = ran[tried[ran]]
     found, total = int(failed.sum()), failed.sum() + step.expected

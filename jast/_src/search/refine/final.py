@@ -66,14 +66,11 @@ def with_refine_share(
         expected = "of at least 0, a share of the episodes"
         share = checks.number(function, "refine", refine, lambda v: 0 <= v < np.inf, expected)
         if share and settings is None:
-            raise ValueError(
-                f"{function}: refine must be 0 inside of jax.jit and jax.vmap, received {refine!r}"
-            )
+            must = "be 0 inside of jax.jit and jax.vmap"
+            raise checks.wrong(function, "refine", must, f"{refine!r}")
         if share and lacking:
-            raise ValueError(
-                f"{function}: refine must be 0, since {lacking} has no quantile function, received"
-                f" {refine!r}"
-            )
+            must = f"be 0, since {lacking} has no quantile function"
+            raise checks.wrong(function, "refine", must, f"{refine!r}")
     return None if settings is None else settings | dict(refine=share)
 
 

@@ -17,6 +17,7 @@ from jast._src.normal_space.mode_coordinates import centred
 from jast._src.normal_space.transform import normal_of, unit
 from jast._src.search.refine.connectivity import ALIKE, Paths, assigned, components, moved_in_time
 from jast._src.util import display
+from jast._src.util.checks import instance
 
 __all__ = ["UNKNOWN", "Mode", "Modes", "modes", "owners", "pointing", "spread"]
 
@@ -165,11 +166,9 @@ def modes(
         2
     """
     for name, given in (("likeliest", likeliest), ("others", others)):
-        if not isinstance(given, Failures) and not (given is None and name == "others"):
-            raise ValueError(
-                f"modes: {name} must be an archive of jast.failures, as the failures of a result,"
-                f" received {type(given).__name__}"
-            )
+        if name == "likeliest" or given is not None:
+            words = "an archive of jast.failures, as the failures of a result"
+            instance("modes", name, given, Failures, words)
     n = len(likeliest)
     if not n:
         return Modes()

@@ -134,11 +134,8 @@ def refine(
     gradients = bool(gradients) and not runs_on_host(sim)
     settings = call_settings(name, key, budget=budget, gradients=int(gradients))
     given = failures.episodes if isinstance(failures, Failures) else failures
-    if not isinstance(given, Episode):
-        raise ValueError(
-            f"{name}: failures must be an archive of jast.failures or a batch of failing episodes,"
-            f" received {type(failures).__name__}"
-        )
+    words = "an archive of jast.failures or a batch of failing episodes"
+    checks.instance(name, "failures", given, Episode, words)
     if not np.ndim(given.length):
         given = jax.tree.map(lambda a: np.asarray(a)[None], given)
     given = jax.device_get(given._replace(states=None))

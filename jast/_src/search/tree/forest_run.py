@@ -34,6 +34,7 @@ from jast._src.search.tree.memory import LANES, fit, require_rewards
 from jast._src.search.tree.results import result, traced_result
 from jast._src.search.tree.run import Plan, Round, grow_all, grow_traced
 from jast._src.search.tree.settings import mode_settings, problem_of
+from jast._src.util.checks import one_of, wrong
 
 __all__ = ["grow_trees"]
 
@@ -126,10 +127,8 @@ def grow_trees(
         found = traced_result(sim, job.reward, grown)
         return with_calibration(sim, job.reward, job.calibration, found, top)
     if keep_trees and memoize in ("root", "none"):
-        raise ValueError(
-            f'{method}: memoize must be "node" or "auto" with keep_trees=True, which needs states'
-            f" at every node, received {memoize!r}"
-        )
+        must = 'be "node" or "auto" with keep_trees=True, which needs states at every node'
+        raise wrong(method, "memoize", must, f"{memoize!r}")
     wanted = job.plan._replace(record=bool(record), branches=bool(keep_trees))
     if lanes is None and executor is not None:
         lanes = min(LANES, -(-job.at_once // max(job.at_once // EXECUTOR_LANES, 1)))
@@ -173,10 +172,7 @@ def plan(
 ) -> Job:
     """The `Job` without heads; ValueError for settings that do not fit one another or ``sim``."""
     trees, simulations = counts["trees"], counts["simulations"]
-    if memoize not in MEMOIZE:
-        raise ValueError(
-            f'{method}: memoize must be "auto", "node", "root" or "none", received {memoize!r}'
-        )
+    one_of(method, "memoize", memoize, MEMOIZE)
     published = chosen["mode"] in PUBLISHED
     if actions is None:
         actions = samples() if published else default_actions(method, sim)
@@ -227,10 +223,8 @@ def with_heads(
     sim, actions = job.sim, job.problem.choice.actions
     training = init_heads(jax.random.fold_in(key, job.trees), sim, actions, heads, head_settings)
     if job.problem.choice.follow and training.value is not None:
-        raise ValueError(
-            f"{job.method}: follow must be False with a value head, since that judges each child"
-            f" by an action drawn for it, received True (mode={mode!r})"
-        )
+        must = "be False with a value head, since that judges each child by an action drawn for it"
+        raise wrong(job.method, "follow", must, f"True (mode={mode!r})")
     problem = job.problem._replace(guide=guide(training.heads, head_settings))
     learns = head_settings.train
     edges = learns and head_settings.edges == "all" and training.value is not None

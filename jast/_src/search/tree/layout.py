@@ -210,25 +210,20 @@ def levels(sim: Simulator) -> int:
     return sim.horizon + signature_of(sim).random_start
 
 
-def _pages(simulations, levels=0, table=None):
-    """One for each node, and one more whenever one is full; ``levels`` and ``table`` bound how
-    many, where children need a place before they are visited.
+def pages_of(problem, simulations):
+    """Pages of a tree of so many simulations: one for each node, and one more whenever one is
+    full.
     """
     more = simulations // PAGE
-    if levels:  # at each level, the visits of all nodes are at most the simulations
+    if problem.values and problem.guide.eager:  # children stand on pages before they are visited
+        levels, table = problem.levels, problem.settings.widths
+        # at each level, the visits of all nodes are at most the simulations
         n = np.arange(1, simulations + 2)
         children = (
             n if is_traced(table) else np.asarray(table).reshape(-1, simulations + 2).max(0)[1:]
         )
         more = int(simulations * levels * np.max((-(-children // PAGE) - 1) / n)) + levels
     return simulations + 1 + more + 1
-
-
-def pages_of(problem, simulations):
-    """Pages of a tree of so many simulations."""
-    if problem.values and problem.guide.eager:  # children stand on pages before they are visited
-        return _pages(simulations, problem.levels, problem.settings.widths)
-    return _pages(simulations)
 
 
 def most_lanes(pages):

@@ -15,6 +15,7 @@ from jast._src.core.counter_prng import coin
 from jast._src.distributions.flat_rows import unflat
 from jast._src.runtime._jax import is_traced
 from jast._src.search.tree.layout import Problem, Settings, widths
+from jast._src.util.checks import one_of, truth_value, wrong
 from jast._src.util.pytrees import count_numbers, select
 
 __all__ = ["PLAIN", "mode_settings", "problem_of"]
@@ -43,23 +44,18 @@ def mode_settings(
     Raises:
         ValueError: for an unknown mode, or a setting out of range.
     """
-    if mode not in modes:
-        raise ValueError(f"{method}: mode must be one of {sorted(modes)}, received {mode!r}")
+    one_of(method, "mode", mode, modes)
     chosen = modes[mode] | {name: value for name, value in given.items() if value is not None}
     if chosen["focus"] is None and actions is not None:
         chosen["focus"] = getattr(actions, "focus", 1.0)
     widening, focus = chosen["widening"], chosen["focus"]
     pair = isinstance(widening, tuple | list) and len(widening) == 2
     if not pair or not (is_traced(*widening) or (widening[0] > 0 and 0 <= widening[1] <= 1)):
-        raise ValueError(
-            f"{method}: widening must be a pair (k, alpha) with k > 0 and 0 <= alpha <= 1,"
-            f" received {widening!r}"
-        )
+        must = "be a pair (k, alpha) with k > 0 and 0 <= alpha <= 1"
+        raise wrong(method, "widening", must, f"{widening!r}")
     if focus is not None and not is_traced(focus) and not focus > 0:
         raise ValueError(f"{method}: focus must be above 0, received {focus!r}")
-    for name in SWITCHES:
-        if not isinstance(chosen[name], bool):
-            raise ValueError(f"{method}: {name} must be True or False, received {chosen[name]!r}")
+    truth_value(method, **{name: chosen[name] for name in SWITCHES})
     return dict(mode=mode) | chosen
 
 

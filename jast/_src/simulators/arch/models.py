@@ -16,7 +16,7 @@ from jast._src.core.typing import Array
 from jast._src.simulators.arch import cars, transmission
 from jast._src.simulators.arch.specifications import named
 from jast._src.specs.robustness import reach
-from jast._src.util.checks import whole_number
+from jast._src.util.checks import one_of, whole_number, wrong
 from jast.distributions import Independent, Uniform
 from jast.specs import Formula, under
 
@@ -144,24 +144,18 @@ def simulate(
         >>> dt
         0.05
     """
-    if model not in MODELS:
-        raise ValueError(f"simulate: model must be one of {list(MODELS)}, received {model!r}")
+    one_of("simulate", "model", model, MODELS)
     of = MODELS[model]
     times, inputs = np.asarray(times, np.float64), np.asarray(inputs, np.float64)
     rising = times.ndim == 1 and len(times) and times[0] == 0 and np.isfinite(times).all()
     if not (rising and (np.diff(times) > 0).all()):
         raise ValueError(f"simulate: times must rise from 0, received {times}")
     if inputs.shape != (len(times), len(of.INPUTS)):
-        raise ValueError(
-            f"simulate: inputs must have the shape {(len(times), 2)}, received {inputs.shape}"
-        )
+        raise wrong("simulate", "inputs", f"have the shape {(len(times), 2)}", inputs.shape)
     for (name, low, high), column in zip(of.INPUTS, inputs.T, strict=True):
         if not ((low <= column) & (column <= high)).all():
             raise ValueError(f"simulate: inputs: {name} must be in [{low:g}, {high:g}]")
-    if interpolation not in ("step", "linear"):
-        raise ValueError(
-            f'simulate: interpolation must be "step" or "linear", received {interpolation!r}'
-        )
+    one_of("simulate", "interpolation", interpolation, ("step", "linear"))
     driven = _means(times, inputs, interpolation, of.DT, round(of.DURATION / of.DT))
     start = of.start()
     _, after = _drive(of)(start, jnp.asarray(driven, jnp.zeros(()).dtype))
@@ -201,9 +195,7 @@ def _driven(
     """A model under a requirement."""
     segments, total = whole_number(function, "segments", segments), round(model.DURATION / model.DT)
     if total % segments:
-        raise ValueError(
-            f"{function}: segments must divide {total}, the samples of a run, received {segments}"
-        )
+        raise wrong(function, "segments", f"divide {total}, the samples of a run", segments)
     formula = named(function, prefix, requirement)
     each = total // segments
     needed = min(reach(formula, model.DT), total)

@@ -12,6 +12,7 @@ from types import MappingProxyType
 
 import jax.numpy as jnp
 
+from jast._src.util.checks import wrong
 from jast.specs import Formula, always, eventually, implies, predicate
 
 __all__ = ["SPECIFICATIONS", "named"]
@@ -89,7 +90,5 @@ def named(function: str, prefix: str, requirement: str | Formula) -> Formula:
         return requirement
     names = [name for name in SPECIFICATIONS if name.startswith(prefix)]
     if requirement not in names:
-        raise ValueError(
-            f"{function}: requirement must be a formula or one of {names}, received {requirement!r}"
-        )
+        raise wrong(function, "requirement", f"be a formula or one of {names}", f"{requirement!r}")
     return SPECIFICATIONS[requirement]

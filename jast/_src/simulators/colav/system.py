@@ -30,6 +30,7 @@ from jast._src.simulators.colav.vessels import (
     world_velocity,
 )
 from jast._src.simulators.parameter import positive
+from jast._src.util.checks import wrong
 
 __all__ = ["COLLISION", "ColavState", "colav"]
 
@@ -144,9 +145,8 @@ def colav(
     try:
         noise_of_position, noise_of_velocity = noise
     except (TypeError, ValueError):
-        raise ValueError(
-            f"colav: noise must be a pair, of position (m) and velocity (m/s), received {noise!r}"
-        ) from None
+        must = "be a pair, of position (m) and velocity (m/s)"
+        raise wrong("colav", "noise", must, f"{noise!r}") from None
     scales = positive(
         "colav",
         longest_delay=longest_delay,
@@ -182,9 +182,7 @@ def _kinds(disturbances):
     """The kinds of disturbance as a tuple; ValueError for what is none."""
     kinds = tuple(disturbances) if isinstance(disturbances, tuple | list) else (disturbances,)
     if not kinds or not all(kind in KINDS for kind in kinds) or len(set(kinds)) != len(kinds):
-        raise ValueError(
-            f"colav: disturbances must be one or several of {KINDS}, received {disturbances!r}"
-        )
+        raise wrong("colav", "disturbances", f"be one or several of {KINDS}", f"{disturbances!r}")
     return kinds
 
 
@@ -194,9 +192,7 @@ def _settled(scenario, dtype):
         scenario = SCENARIOS.get(scenario, scenario)
     if not isinstance(scenario, Scenario):
         received = repr(scenario) if isinstance(scenario, str) else type(scenario).__name__
-        raise ValueError(
-            f"colav: scenario must be one of {list(SCENARIOS)} or a Scenario, received {received}"
-        )
+        raise wrong("colav", "scenario", f"be one of {list(SCENARIOS)} or a Scenario", received)
     shapes = dict(
         adversary="three numbers (north, east, heading)",
         route="[steps, 3] (surge, sway, yaw rate)",
@@ -208,13 +204,10 @@ def _settled(scenario, dtype):
         try:
             a = jnp.asarray(value, dtype)
         except (TypeError, ValueError):
-            raise ValueError(
-                f"colav: {name} of the scenario must be {expected}, received {value!r}"
-            ) from None
+            must = f"be {expected}"
+            raise wrong("colav", f"{name} of the scenario", must, f"{value!r}") from None
         if a.ndim != 1 + (name == "route") or a.shape[-1] != 3 or a.shape[0] < 1:
-            raise ValueError(
-                f"colav: {name} of the scenario must be {expected}, received shape {a.shape}"
-            )
+            raise wrong("colav", f"{name} of the scenario", f"be {expected}", f"shape {a.shape}")
         if not is_traced(a) and not np.isfinite(a).all():
             raise ValueError(f"colav: {name} of the scenario must be finite, received {value!r}")
         arrays[name] = a

@@ -20,7 +20,7 @@ from jast._src.simulators.fms.database import APART, KLAX, KSFO, POSITIONS
 from jast._src.simulators.fms.events import Misses
 from jast._src.simulators.fms.geodesic import EARTHS, Earth, direct
 from jast._src.simulators.fms.lateral import KNOT, NMI, Build, Path, lateral
-from jast._src.util.checks import real_number, whole_number
+from jast._src.util.checks import real_number, truth_value, whole_number, wrong
 
 __all__ = ["MEANS", "SIGMAS", "FmsState", "fms", "fms_misses", "fms_path"]
 
@@ -109,12 +109,8 @@ def fms(
         ("earth", earth, (*EARTHS,)),
     ):
         if value not in known:
-            raise ValueError(
-                f"fms: {name} must be one of {', '.join(map(repr, known))}, received {value!r}"
-            )
-    for name, value in (("fixed", fixed), ("snap", snap), ("database", database)):
-        if not isinstance(value, bool):
-            raise ValueError(f"fms: {name} must be True or False, received {value!r}")
+            raise wrong("fms", name, f"be one of {', '.join(map(repr, known))}", f"{value!r}")
+    truth_value("fms", fixed=fixed, snap=snap, database=database)
     eps = real_number("fms", "eps", eps, lambda v: 0 <= v < jnp.inf, "of nmi, at least 0")
     bank = real_number("fms", "bank", bank, lambda v: 0 < v < 90, "of degrees between 0 and 90")
     tas = real_number("fms", "tas", tas, lambda v: 0 < v < jnp.inf, "of knots, positive")
@@ -196,18 +192,14 @@ def fms_misses(sim: Simulator, episode: Episode | FmsState) -> Misses:
 def _route(caller, sim, episode):
     model = next(iter(getattr(getattr(sim, "init", None), "args", ())), None)
     if not isinstance(model, Model):
-        raise ValueError(
-            f"{caller}: sim must be a jast.simulators.fms(), received {type(sim).__name__}"
-        )
+        raise wrong(caller, "sim", "be a jast.simulators.fms()", type(sim).__name__)
     state = episode
     if isinstance(episode, Episode):
         states = replay(sim, episode).states if episode.states is None else episode.states
         state = jax.tree.map(lambda a: jnp.asarray(a)[episode.length], states)
     if not isinstance(state, FmsState) or jnp.shape(state.waypoints) != (model.waypoints, 2):
-        raise ValueError(
-            f"{caller}: episode must be one Episode or FmsState of {model.waypoints} waypoints,"
-            f" received {type(state).__name__}"
-        )
+        must = f"be one Episode or FmsState of {model.waypoints} waypoints"
+        raise wrong(caller, "episode", must, type(state).__name__)
     _double()
     return model, state
 
