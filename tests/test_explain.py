@@ -117,6 +117,25 @@ def test_minimal_tells_what_was_tried_from_what_was_not():
     assert "perhaps" not in str(all_)
 
 
+@pytest.mark.parametrize("hosted", [False, True])
+def test_long_explanations_have_a_bar(key, capsys, hosted):
+    sim = sums(np.ones(4), 3.0)
+    if hosted:
+        run = lambda x: (float(x.sum()) >= 3.0, max(3.0 - float(x.sum()), 0.0))
+        sim = jast.blackbox.from_python(run, horizon=4, disturbance=Normal(0.0, 1.0))
+    e = jast.replay(sim, jnp.ones(4))
+    for name, call in [
+        ("minimal", lambda **bar: explain.minimal(sim, e, budget=100, **bar)),
+        ("criticality", lambda **bar: explain.criticality(key, sim, e, draws=20, **bar)),
+        ("attribution", lambda **bar: explain.attribution(sim, e, permutations=4, **bar)),
+    ]:
+        quiet = str(call())
+        assert capsys.readouterr().err == ""
+        assert str(call(progress=True)) == quiet
+        said = capsys.readouterr().err
+        assert f"{name}: compiling" in said and f"{name}: 100%" in said
+
+
 def test_criticality_of_a_walk(key):
     """P(fail | s_t) = Phi((s_t - limit) / sqrt(T - t)), within 4 standard errors of 2000 draws at
     every step; the last step decides.

@@ -15,6 +15,7 @@ from jast._src.normal_space import episode_point
 from jast._src.normal_space.episode_point import EpisodePoint
 from jast._src.normal_space.gradients import gradients
 from jast._src.runtime.host_errors import runs_on_host
+from jast._src.runtime.progress_bar import Watch
 from jast._src.util import checks, display
 
 __all__ = ["Attribution", "attribution"]
@@ -77,6 +78,7 @@ def attribution(
     key: PRNGKey | None = None,
     permutations: int = 200,
     budget: int | None = None,
+    progress: bool = False,
 ) -> Attribution:
     """Which disturbances brought the failure about, and by how much?
 
@@ -97,6 +99,7 @@ def attribution(
             other order is the one before it reversed (antithetic).
         budget: of "shapley": evaluations at most; there are fewer orders where it affords no more.
             Default: none; 1000 of a black box.
+        progress: whether there is a bar, of "shapley".
 
     Returns:
         `Attribution`.
@@ -129,7 +132,9 @@ def attribution(
     error, cost = np.zeros(len(g.v)), 0
     if method == "shapley":
         permutations = _affordable(g, permutations, budget)
-        values, error = _shapley(g, float(quiet), key, permutations)
+        total_runs = g.evaluate.spent + 2 * -(-permutations // 2) * np.count_nonzero(g.v)
+        with Watch(name, total_runs, "sim", progress, None) as g.evaluate.watch:
+            values, error = _shapley(g, float(quiet), key, permutations)
     elif method == "integrated":
         values, cost = _integrated(g), 4 * POINTS
     else:

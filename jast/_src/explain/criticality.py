@@ -13,7 +13,8 @@ from jast._src.core.episode import Episode, play_chosen, replay
 from jast._src.core.rewards import log_likelihood
 from jast._src.core.simulator import Simulator, require_simulator
 from jast._src.core.typing import PRNGKey
-from jast._src.runtime.host_errors import runs_on_host
+from jast._src.runtime.host_errors import runs_made, runs_on_host, telling_runs
+from jast._src.runtime.progress_bar import Watch
 from jast._src.util import checks, display
 from jast._src.util.intervals import checked_level, clopper_pearson
 from jast._src.util.pytrees import map_in_lanes, select
@@ -86,6 +87,7 @@ def criticality(
     draws: int | None = None,
     level: float = 0.95,
     budget: int | None = None,
+    progress: bool = False,
 ) -> Criticality:
     """When was the failure still avoidable?
 
@@ -102,6 +104,7 @@ def criticality(
         level: of the intervals, each for itself.
         budget: evaluations at most, all of them counted. Default: none; 1000 of a black box where
             ``draws`` is left out.
+        progress: whether there is a bar.
 
     Returns:
         `Criticality`.
@@ -144,10 +147,16 @@ def criticality(
 
     def lanes(at, kept):
         keys = jax.random.split(jax.random.fold_in(key, at[0]), size)
-        return _continued(keys, sim, *given, kept)
+        found = jax.block_until_ready(_continued(keys, sim, *given, kept))
+        watch.reach(min(int(at[0]) + size, len(rows)))
+        return found
 
-    at = np.arange(len(rows), dtype=np.int32)
-    ended, wrong = map_in_lanes(size, lanes, at, rows)
+    def tell(failing):
+        watch.reach(min(runs_made(sim) - made, len(rows)))
+
+    at, made = np.arange(len(rows), dtype=np.int32), runs_made(sim)
+    with Watch(name, len(rows), "sim", progress, None) as watch, telling_runs(sim, tell):
+        ended, wrong = map_in_lanes(size, lanes, at, rows)
     failing, invalid = np.bincount(rows[ended], minlength=steps + 1), int(wrong.sum())
     p = failing / draws
     interval = np.stack([clopper_pearson(int(k), draws, level) for k in failing])

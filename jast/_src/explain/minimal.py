@@ -12,6 +12,7 @@ from jast._src.core.simulator import Simulator
 from jast._src.normal_space import episode_point, transform
 from jast._src.normal_space.episode_point import EpisodePoint
 from jast._src.runtime.host_errors import runs_on_host
+from jast._src.runtime.progress_bar import Watch
 from jast._src.util import display
 from jast._src.util.checks import number, whole_number
 from jast._src.util.pytrees import index_tree
@@ -77,6 +78,7 @@ def minimal(
     orders: int = 8,
     slack: float = 0.1,
     budget: int | None = None,
+    progress: bool = False,
 ) -> Minimal:
     """Which disturbances of a failure are needed, and how large must they be?
 
@@ -98,6 +100,7 @@ def minimal(
             needed disturbance and order. Default: 5000; 500 of a black box, whose runs are never
             more than the budget, at least 10. The small ones are tried first, and what was not
             tried by then stays: ``untried`` says which, and ``complete`` whether all was done.
+        progress: whether there is a bar.
 
     Returns:
         `Minimal`.
@@ -123,8 +126,9 @@ def minimal(
     g = episode_point.failing_point(name, sim, episode, most=budget)
     if (farther := g._replace(v=(1 + slack) * g.v)).evaluate(farther.v[None]).failure[0]:
         g = farther
-    kept, tried = _find_needed(g, orders, budget)
-    v = _shrink(g, np.where(kept, g.v, 0.0), budget)
+    with Watch(name, budget, "sim", progress, None) as g.evaluate.watch:
+        kept, tried = _find_needed(g, orders, budget)
+        v = _shrink(g, np.where(kept, g.v, 0.0), budget)
     e = transform.played(g.sim, v[None])
     e = jax.device_get(replay(sim, index_tree(e._replace(states=None), 0)))
     kept &= episode_point.number_steps(sim) <= int(e.length)

@@ -15,6 +15,7 @@ from jast._src.runtime._jax import is_brief, jit
 from jast._src.runtime.checkpoints import answer_once
 from jast._src.runtime.device import BLOCK, block_size, on_cpu
 from jast._src.runtime.host_errors import runs_on_host
+from jast._src.runtime.progress_bar import Watch
 
 __all__ = [
     "PointEvaluator",
@@ -38,6 +39,7 @@ class PointEvaluator:
     def __init__(self, sim: Simulator, most: int | None = None):
         self.sim, self.dtype, self.spent = sim, transform.normal_numbers(sim), 0
         self.most = most if runs_on_host(sim) else None
+        self.watch: Watch | None = None  # whose bar moves with every call
 
     def __call__(self, points: np.ndarray) -> transform.Outcomes:
         """`Outcomes` [m] of ``points`` [m, D]."""
@@ -45,8 +47,11 @@ class PointEvaluator:
         n = len(points)
         room = n if self.most is None else max(min(n, self.most - self.spent), 0)
         self.spent += room
-        if room == n:
-            return evaluate_points(self.sim, points)
+        found = evaluate_points(self.sim, points[:room]) if room else None
+        if self.watch is not None:
+            self.watch.reach(min(self.spent, self.watch.total))
+        if found is not None and room == n:
+            return found
         none = transform.Outcomes(
             failure=np.zeros(n, bool),
             distance=np.full(n, np.inf, self.dtype),
@@ -55,9 +60,8 @@ class PointEvaluator:
             invalid=np.ones(n, bool),
             log_p=np.full(n, -np.inf, self.dtype),
         )
-        if not room:
+        if found is None:
             return none
-        found = evaluate_points(self.sim, points[:room])
         return jax.tree.map(lambda a, b: np.concatenate([a, b[room:]]), found, none)
 
 
