@@ -85,8 +85,8 @@ def make_plan(
     ).items():
         if name in chosen:
             one_of(method, name, chosen[name], allowed)
-    truths = dict(elitism=chosen["elitism"], current=chosen.get("current", False), ratchet=ratchet)
-    truth_value(method, **truths)
+    current = chosen.get("current", False)
+    truth_value(method, elitism=chosen["elitism"], current=current, ratchet=ratchet)
     positive = (lambda v: 0 < v < math.inf), "above 0"
     other = (lambda v: 0 <= v < math.inf), "of at least 0"
     numbers = (

@@ -41,10 +41,6 @@ NOISES = (1e-4, 1e-2)  # the grid of the noise's variance, as shares of the sign
 JITTER = 1e-6  # added to every noise, so that float32 factors stay positive definite
 
 
-def _squared_exponential(r2):
-    return jnp.exp(-0.5 * r2)  # R&W eq. 4.9
-
-
 def _matern(terms, r2):
     """R&W eq. 4.17: a polynomial of sqrt(2 nu) r times its decaying exponential."""
     # sqrt has no derivative at 0
@@ -53,7 +49,7 @@ def _matern(terms, r2):
 
 
 KERNELS = {
-    "squared exponential": _squared_exponential,
+    "squared exponential": lambda r2: jnp.exp(-0.5 * r2),  # R&W eq. 4.9
     "matern12": lambda r2: _matern((1.0,), r2),
     "matern32": lambda r2: _matern((1.0, 1.0), r2),
     "matern52": lambda r2: _matern((1.0, 1.0, 1 / 3), r2),

@@ -15,6 +15,7 @@ from jast._src.heads.heads import Heads
 from jast._src.heads.networks import ACTIVATIONS, Head, dense
 from jast._src.io import save_load
 from jast._src.io.codec import Given, check_fits
+from jast._src.io.npz import misfit, unknown
 from jast._src.util.checks import instance, whole_number, wrong
 
 __all__ = ["load", "parts", "whole"]
@@ -109,28 +110,21 @@ def _head(path, name, about, given):
     """
     if about is None:
         if given is not None:
-            raise ValueError(
-                f"load: {path} does not fit heads: it holds no {name} head, expected one"
-            )
+            raise misfit(path, "heads", f"it holds no {name} head, expected one")
         return None
     network, params = about["network"], about["params"]
     if given is not None:
         expected = _specification(given)
         if None not in (network, expected) and network != expected:
-            raise ValueError(
-                f"load: {path} does not fit heads: {name} is the network {network}, expected"
-                f" {expected}"
-            )
+            words = f"{name} is the network {network}, expected {expected}"
+            raise misfit(path, "heads", words)
     elif network is None:
         raise ValueError(
             f"load: {path} holds a {name} head with a function that is not in the file: load(path,"
             " heads=heads) with Heads that have it"
         )
     elif network["activation"] not in ACTIVATIONS:
-        raise ValueError(
-            f"load: {path} has the activation {network['activation']!r}, which this jast does not"
-            " know: use the jast that wrote the file"
-        )
+        raise unknown(path, f"has the activation {network['activation']!r}")
     like, apply = _made(network) if given is None else given
     other = "its network" if given is None else "heads"
     check_fits(path, other, f"{name}.params", params, like)

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jast._src.io import former_files
+from jast._src.io.npz import misfit, unknown
 from jast._src.runtime._jax import is_traced
 from jast._src.util.pytrees import fields_of
 
@@ -166,10 +167,7 @@ def decode(node: Any, path: Any, arrays: dict[str, np.ndarray], given: Given) ->
         return None
     if kind == "kind":
         return below(former_files.node_of(*about))
-    raise ValueError(
-        f"load: {path} holds {kind!r}, which this jast does not know: use the jast that wrote the"
-        " file"
-    )
+    raise unknown(path, f"holds {kind!r}")
 
 
 def check_episodes(path: Any, sim: Any, *values: Any) -> None:
@@ -200,19 +198,14 @@ def check_fits(
     """
     structure, expected = jax.tree.structure(value), jax.tree.structure(like)
     if structure != expected:
-        raise ValueError(
-            f"load: {path} does not fit {other}: {name} has the structure {structure}, expected"
-            f" {expected}"
-        )
+        raise misfit(path, other, f"{name} has the structure {structure}, expected {expected}")
     pairs = jax.tree_util.tree_leaves_with_path(like)
     for a, (at, s) in zip(jax.tree.leaves(value), pairs, strict=True):
         shape, wanted = np.shape(a)[axes:], (*rows, *np.shape(s))
         dtype, kind = jnp.result_type(a), jnp.result_type(s)
         if shape != wanted or _kind_of_number(dtype) != _kind_of_number(kind):
-            raise ValueError(
-                f"load: {path} does not fit {other}: {name}{jax.tree_util.keystr(at)} has"
-                f" {dtype.name}{list(shape)}, expected {kind.name}{list(wanted)}"
-            )
+            has = f"{dtype.name}{list(shape)}, expected {kind.name}{list(wanted)}"
+            raise misfit(path, other, f"{name}{jax.tree_util.keystr(at)} has {has}")
 
 
 def name_of(value: Any) -> str | None:
@@ -253,10 +246,7 @@ def _fields(name: str, value: Any) -> dict[str, Any]:
 
 def _record(path: Any, name: str, fields: dict[str, Any], given: Given) -> Any:
     if name not in RECORDS:
-        raise ValueError(
-            f"load: {path} holds a {name}, which this jast does not know: use the jast that wrote"
-            " the file"
-        )
+        raise unknown(path, f"holds a {name}")
     if name in WITH_FUNCTIONS:
         return importlib.import_module(WITH_FUNCTIONS[name]).whole(path, fields, given)
     if name == "Failures" and given.sim is not None:
@@ -292,7 +282,5 @@ def _own(path: Any, given: Given, name: str, names: list[str]) -> Any:
             return jax.tree.structure(node, is_leaf=lambda child, own=node: child is not own)
         left += children
     other = "heads" if given.sim is None else "sim"
-    raise ValueError(
-        f"load: {path} does not fit {other}: it holds values of the class {name}, which {other}"
-        " does not have"
-    )
+    words = f"it holds values of the class {name}, which {other} does not have"
+    raise misfit(path, other, words)

@@ -22,7 +22,7 @@ from jast._src.core.typing import PathLike
 from jast._src.io.atomic import replacing
 from jast._src.util.checks import check_path
 
-__all__ = ["pack", "read", "unpack", "write"]
+__all__ = ["misfit", "pack", "read", "unknown", "unpack", "write"]
 
 Header = dict[str, Any]
 Arrays = dict[str, np.ndarray]
@@ -111,6 +111,17 @@ def unpack(
     if header.pop("sha256", None) != _checksum(header, arrays):
         raise ValueError(f"load: {path} is damaged: its checksum does not match")
     return header, arrays
+
+
+def misfit(path: Any, other: str, words: str) -> ValueError:
+    """The error where a file does not fit what was given with it."""
+    return ValueError(f"load: {path} does not fit {other}: {words}")
+
+
+def unknown(path: Any, what: str) -> ValueError:
+    """The error where a file holds what only a later version writes."""
+    words = "which this jast does not know: use the jast that wrote the file"
+    return ValueError(f"load: {path} {what}, {words}")
 
 
 def _entries(format: str, version: int, header: Header, arrays: Arrays) -> Arrays:

@@ -67,7 +67,7 @@ __all__ = [
     "wrong",
 ]
 
-BLUE, VERMILION, GREEN, PURPLE, ORANGE, SKY = COLOURS = (
+BLUE, VERMILION, GREEN, PURPLE, ORANGE, _ = COLOURS = (
     "#0072B2",
     "#D55E00",
     "#009E73",

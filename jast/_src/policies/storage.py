@@ -12,6 +12,7 @@ import jax.numpy as jnp
 from jast._src.core.check import OBSERVED, contract
 from jast._src.core.signature import signature_of
 from jast._src.io.codec import Given, check_fits
+from jast._src.io.npz import misfit
 from jast._src.policies.actor import count_latents, make_networks, parameter_shapes
 from jast._src.policies.failure_policy import FailurePolicy, assemble
 from jast._src.policies.q_learning_training import Table
@@ -41,10 +42,8 @@ def whole(path: Any, fields: dict[str, Any], given: Given) -> FailurePolicy:
         )
     contract("load", sim, observed=OBSERVED)
     if fields["horizon"] != sim.horizon:
-        raise ValueError(
-            f"load: {path} does not fit sim: its horizon is {fields['horizon']}, expected"
-            f" {sim.horizon}"
-        )
+        words = f"its horizon is {fields['horizon']}, expected {sim.horizon}"
+        raise misfit(path, "sim", words)
     n, n0 = count_latents(sim, "load")
     layers = learned.actor["params"]
     *hidden, outputs = (len(layers[f"Dense_{i}"]["bias"]) for i in range(len(layers)))

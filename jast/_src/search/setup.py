@@ -3,7 +3,7 @@ told, and named for the result.
 """
 
 from dataclasses import fields, is_dataclass, replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 
@@ -17,19 +17,7 @@ from jast._src.search.calibration import Calibration, calibrate
 from jast._src.util.checks import check_random_key
 from jast._src.util.display import call_settings
 
-__all__ = ["Ready", "default_actions", "prepare"]
-
-
-class Ready(NamedTuple):
-    """What a search starts with."""
-
-    reward: Any
-    """A pytree."""
-    actions: Any
-    settings: dict | None
-    """With names and seed; None if traced."""
-    calibration: Calibration | None
-    """The episodes that gave the scales; None where all were given."""
+__all__ = ["default_actions", "prepare"]
 
 
 def default_actions(function: str, sim: Simulator) -> choices.Wide | choices.Samples:
@@ -49,9 +37,11 @@ def prepare(
     *,
     widen: str = "always",
     **settings: Any,
-) -> Ready:
-    """The `Ready` of a search by the name ``function``, of its arguments and other ``settings``;
-    ``widen`` of `search.calibration.calibrate`. ValueError unless `contract` holds.
+) -> tuple[Any, Any, dict | None, Calibration | None]:
+    """What a search by the name ``function`` starts with, of its arguments and other ``settings``:
+    the reward, a pytree, the actions, the settings with names and seed (None if traced), and the
+    episodes that gave the scales (None where all were given); ``widen`` of
+    `search.calibration.calibrate`. ValueError unless `contract` holds.
     """
     check_random_key(function, key)
     contract(function, sim, actions)
@@ -59,7 +49,7 @@ def prepare(
     reward, actions, calibration = _scaled(sim, reward, actions, widen)
     reward = rewards.as_pytree(reward)
     if is_traced(key, sim, reward, actions, settings) or is_tracing():
-        return Ready(reward, actions, None, calibration)
+        return reward, actions, None, calibration
     func = getattr(reward, "func", reward)
     name = getattr(func, "__name__", None) or f"rewards.{type(func).__name__.lower()}"
     settings = call_settings(function, key, **settings) | dict(
@@ -68,7 +58,7 @@ def prepare(
         actions=ACTIONS.get(type(actions), type(actions).__name__),
         action_settings=_settings(actions),
     )
-    return Ready(reward, actions, settings, calibration)
+    return reward, actions, settings, calibration
 
 
 def _scaled(

@@ -6,18 +6,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from jast._src.estimate.gaussians import half_spaces
 from jast._src.estimate.gaussians.design_points import distinct, explained
 from jast._src.estimate.gaussians.family import GaussianFamily
-from jast._src.estimate.gaussians.half_spaces import (
-    Planes,
-    first_layers,
-    fit_layers,
-    layers_as_latent,
-    merge_planes,
-    no_planes,
-    planes_of,
-    that_matter,
-)
 from jast._src.estimate.gaussians.mixture_fit import effective_sample_size
 from jast._src.estimate.host_populations import draw_wide
 from jast._src.estimate.proposal_search.search_state import (
@@ -65,7 +56,7 @@ def explore_moments(f: GaussianFamily, given: np.ndarray | None, gradients: bool
     if start is None:
         return state
     end = f.settings.exploration_end * f.budget
-    planes = no_planes(f.dimension)
+    planes = half_spaces.no_planes(f.dimension)
     state, planes = _approach(f, state, planes, start, gradients, end)
     for _ in range(GIVEN if given is not None else 0):
         rest = given[~explained(given, planes.nearest, KNOWN)] if len(planes.depth) else given
@@ -80,7 +71,7 @@ def explore_moments(f: GaussianFamily, given: np.ndarray | None, gradients: bool
     if not len(planes.depth):
         return state.note("moments: no slope leads to failures")
     state, planes = _approach_wide(f, state, planes, gradients, end)
-    state, planes = _with_mirror_images(f, state, that_matter(planes, f.dimension))
+    state, planes = _with_mirror_images(f, state, half_spaces.that_matter(planes, f.dimension))
     depths = f"at {planes.depth.min():.3f} to {planes.depth.max():.3f}"
     state = state.note(f"moments: {len(planes.depth)} half-spaces {depths}")
     return _fit_batches(f, state._replace(anchors=planes.nearest), planes)
@@ -113,12 +104,12 @@ def _approach(f, state, planes, start, gradients, end):
             return state.note("moments: no room for more slopes"), planes
         state, start = _step_back(f, state, start, last)
         here = slopes(f.sim, start.astype(f.dtype), gradients)
-        said = planes_of(here)
+        said = half_spaces.planes_of(here)
         state = state.note(f"moments: linearised at {np.linalg.norm(start):.3f}", cost)
         if not len(said.depth):
             break
         state, new = _to_their_roots(f, state, said, end)
-        planes = merge_planes(planes, new)
+        planes = half_spaces.merge_planes(planes, new)
         top = np.argmin(new.depth)
         if abs(new.depth[top] - said.depth[top]) <= KNOWN:
             break
@@ -162,14 +153,16 @@ def _with_mirror_images(f, state, planes):
     images = planes._replace(normal=-planes.normal)
     k = len(planes.depth)
     each = [index_tree(images, [i]) for i in range(k)]
-    images = index_tree(images, [len(merge_planes(planes, one).depth) > k for one in each])
+    images = index_tree(
+        images, [len(half_spaces.merge_planes(planes, one).depth) > k for one in each]
+    )
     if not len(images.depth):
         return state, planes
     beyond = (images.depth + KNOWN)[:, None] * images.normal
     failure = np.asarray(distances(f.sim, beyond.astype(f.dtype))[0].failure)
     text = f"moments: {failure.sum()} of {len(failure)} mirror images fail"
     both = zip(planes, index_tree(images, failure), strict=True)
-    planes = that_matter(Planes(*map(np.concatenate, both)), f.dimension)
+    planes = half_spaces.that_matter(half_spaces.Planes(*map(np.concatenate, both)), f.dimension)
     return state.note(text, len(failure)), planes
 
 
@@ -195,9 +188,9 @@ def _to_their_roots(f, state, planes, end):
 
 def _fit_batches(f, state, planes):
     """The state after a few batches, each of layers that are fitted to all before it."""
-    first = layers = first_layers(planes)
+    first = layers = half_spaces.first_layers(planes)
     for _ in range(BATCHES):
-        batch = f.draw(layers_as_latent(planes, layers, f.dtype))
+        batch = f.draw(half_spaces.layers_as_latent(planes, layers, f.dtype))
         state = add_batch(f, state, batch)
         failing = len(batch.log_weight)
         if not failing:
@@ -206,7 +199,7 @@ def _fit_batches(f, state, planes):
         text = f"moments: {failing / batch.size:.1%} fail, ESS {ess:.4g}"
         state = state.note(f"{text}; of all: log p {state.log_mean:.3f}", f.batch)
         z = np.concatenate([b.points.z for b in state.batches])
-        layers = fit_layers(z, state.log_weight, planes, first)
-    q = layers_as_latent(planes, layers, f.dtype)
+        layers = half_spaces.fit_layers(z, state.log_weight, planes, first)
+    q = half_spaces.layers_as_latent(planes, layers, f.dtype)
     fitted = efficiency(state, failure_log_ratios(f, state, q))
     return state._replace(q=q, efficiency=fitted) if fitted > state.efficiency else state

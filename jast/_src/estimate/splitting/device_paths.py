@@ -158,7 +158,7 @@ def _play(store, key, time, sim, score, paths, parents, level, m):
 def _first(sim, score, key, fresh, state, value, t, live):
     """The `Lane` that begins at a new start, or at a stored state; done where not ``live``."""
     start = begin(sim, log_likelihood, D.sample(sim.start(), jax.random.fold_in(key, 0)))
-    new = _lane(sim, score, start, 0)
+    new = _lane(score, start, 0)
     ended = (value == jnp.inf) | (t >= sim.horizon) | jnp.asarray(sim.is_terminal(state))
     no = jnp.zeros((), bool)
     old = Lane(state, value, t, value, ended, no, jnp.zeros((), jnp.int32))
@@ -194,12 +194,12 @@ def _next(sim, score, key, lane):
     """The `Lane` one step on; an ended one stays as it is."""
     x = D.sample(sim.disturbance(lane.state), jax.random.fold_in(key, lane.t + 1))
     after = advance(sim, log_likelihood, blank(sim, lane.state), x, lane.t + 1 >= sim.horizon)
-    new = _lane(sim, score, conclude(sim, log_likelihood, after), lane.t + 1)
+    new = _lane(score, conclude(sim, log_likelihood, after), lane.t + 1)
     new = new._replace(top=jnp.maximum(lane.top, new.top), undefined=lane.undefined + new.undefined)
     return jax.tree.map(lambda a, b: jnp.where(lane.done, a, b), lane, new)
 
 
-def _lane(sim, score, progress: Progress, t):
+def _lane(score, progress: Progress, t):
     """The `Lane` at a state; its score is the user's, or minus its own miss distance."""
     value = -progress.distance if score is None else jnp.asarray(score(progress.state))
     value, most = value.astype(progress.distance.dtype), jnp.finfo(progress.distance.dtype).max

@@ -184,7 +184,8 @@ def plan(
         chosen = chosen | dict(focus=getattr(actions, "focus", 1.0))
     asked = dict(trees=trees, simulations=simulations, exploration=exploration) | chosen
     asked["widening"] = list(chosen["widening"])
-    ready = prepare(method, key, sim, reward, actions, **asked)
+    prepared = prepare(method, key, sim, reward, actions, **asked)
+    reward, actions, settings, calibration = prepared
     prunes = min(counts["prunes"], levels(sim))  # a tree of so many roots is at an episode's end
     total = prunes * simulations
     if total >= 2**24:
@@ -192,7 +193,7 @@ def plan(
             f"{method}: prunes * simulations must be below 2**24, received {prunes} *"
             f" {simulations}: grow more trees instead"
         )
-    problem = problem_of(sim, ready.reward, ready.actions, chosen, exploration, total)
+    problem = problem_of(sim, reward, actions, chosen, exploration, total)
     table = problem.settings.widths
     children = total + 1 if is_traced(table) else int(table.max())
     kept = "node" if memoize == "auto" else memoize
@@ -203,8 +204,8 @@ def plan(
         trees=trees,
         at_once=trees,
         top=counts["top"],
-        settings=ready.settings,
-        calibration=ready.calibration,
+        settings=settings,
+        calibration=calibration,
     )
 
 

@@ -140,18 +140,10 @@ def _like(turn: Round) -> TreeBatch:
     _, roots = _prune.eval_shape(problem, tree, plan.children, plan.memoize)
     rows = np.zeros(turn.candidates + turn.lanes, np.int32)
     found = _rebuild.eval_shape(problem, tree, rows, rows, plan.memoize)
-    return TreeBatch(
-        log=0,
-        outcome=0,
-        steps=0,
-        roots=roots,
-        found=found,
-        tree=0,
-        simulation=0,
-        edges=_edges.eval_shape(problem, tree, plan.children) if plan.edges else (),
-        trials=0 if plan.record else (),
-        branches=_branches.eval_shape(problem, tree, plan.children) if plan.branches else (),
-    )
+    edges = _edges.eval_shape(problem, tree, plan.children) if plan.edges else ()
+    branches = _branches.eval_shape(problem, tree, plan.children) if plan.branches else ()
+    trials = 0 if plan.record else ()
+    return TreeBatch(0, 0, 0, roots, found, 0, 0, edges, trials, branches)
 
 
 def _keys(turn: Round, rows: np.ndarray) -> jax.Array:

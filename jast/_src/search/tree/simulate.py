@@ -6,17 +6,9 @@ from jax import lax
 
 from jast._src.core.transition import Progress, blank, conclude
 from jast._src.search.lanes import select_lanes
+from jast._src.search.tree import layout
 from jast._src.search.tree.best_episode import fed_of, fed_source, feed_level, follows, update_lead
 from jast._src.search.tree.child_values import evaluate_children
-from jast._src.search.tree.layout import (
-    Node,
-    choose,
-    choose_rollout,
-    nodes_of,
-    of_lanes,
-    outcome_of,
-    take,
-)
 from jast._src.search.tree.packing import pack
 from jast._src.search.tree.pages import back_up, fills
 from jast._src.search.tree.select import walk_down
@@ -59,7 +51,7 @@ def _simulation(problem, axes, tree, i, memoize):
         desk = lax.dynamic_update_slice_in_dim(
             tree.desk, tree.nodes[at, lane][None], jnp.minimum(i, 0), 0
         )
-        node = nodes_of(tree, memoize, desk[0])
+        node = layout.nodes_of(tree, memoize, desk[0])
         if memoize == "node":
             state, replayed = node.state, jnp.zeros_like(at)
         else:
@@ -116,11 +108,11 @@ def _simulation(problem, axes, tree, i, memoize):
     finite = jnp.isfinite(value)
     worst = jnp.where(finite & tree.alive, jnp.minimum(tree.worst, value), tree.worst)
     backed = jnp.where(finite, value, jnp.where(jnp.isfinite(worst), worst, 0))
-    outcome = outcome_of(failed, fresh | (tree.ended & tree.alive), invalid, tree.alive)
+    outcome = layout.outcome_of(failed, fresh | (tree.ended & tree.alive), invalid, tree.alive)
     state = child.state if memoize == "node" else ()
     told = child.reward, child.distance, child.failure, child.invalid
     log_prob = child.log_prob if recorded else ()
-    kept = Node(walk.node, walk.best.slot, *told, state, source, log_prob)
+    kept = layout.Node(walk.node, walk.best.slot, *told, state, source, log_prob)
 
     def put(into, row, at):
         return lax.dynamic_update_slice_in_dim(into, row[None], at, 0)
@@ -161,14 +153,14 @@ def replay_to(problem, axes, tree, trail, depth, memoize, lane=None, live=None):
     if lane is None:
         lane = jnp.arange(tree.key.shape[0], dtype=jnp.int32)
     else:
-        problem = of_lanes(problem, axes, lane)
+        problem = layout.of_lanes(problem, axes, lane)
         start = index_tree(start, lane)
     key, base, first = start
     move = jax.vmap(child_state, in_axes=(axes, *[0] * 7))
 
     def body(carry):
         level, state = carry
-        node = nodes_of(tree, memoize, tree.nodes[trail[level + 1, lane], lane])
+        node = layout.nodes_of(tree, memoize, tree.nodes[trail[level + 1, lane], lane])
         live = running & (level < depth)
         taken = node.source, fed_source(tree, node.source, lane)
         after = move(problem, key, node.parent, node.slot, level, state, *taken)
@@ -180,13 +172,13 @@ def replay_to(problem, axes, tree, trail, depth, memoize, lane=None, live=None):
 
 
 def _child(problem, tree_key, parent, slot, level, before, source, fed):
-    action = choose(problem, tree_key, parent, slot, level, before.state, source, fed)
-    return take(problem, level, before, action)
+    action = layout.choose(problem, tree_key, parent, slot, level, before.state, source, fed)
+    return layout.take(problem, level, before, action)
 
 
 def _rolled(problem, key, tree_key, level, before, fed):
-    action = choose_rollout(problem, key, tree_key, level, before.state, fed)
-    return take(problem, level, before, action, rolling=True), action[1]
+    action = layout.choose_rollout(problem, key, tree_key, level, before.state, fed)
+    return layout.take(problem, level, before, action, rolling=True), action[1]
 
 
 def child_state(problem, tree_key, parent, slot, level, state, source=(), fed=()):

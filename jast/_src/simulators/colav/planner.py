@@ -29,13 +29,9 @@ class Zone(NamedTuple):
 
 
 ZONES = (
-    Zone(
-        name="region of collision", forward=20.0, starboard=10.0, aft=10.0, port=10.0, weight=1000.0
-    ),
-    Zone(
-        name="high penalty region", forward=25.0, starboard=20.0, aft=15.0, port=15.0, weight=100.0
-    ),
-    Zone(name="low penalty region", forward=40.0, starboard=30.0, aft=25.0, port=25.0, weight=10.0),
+    Zone("region of collision", 20.0, 10.0, 10.0, 10.0, 1000.0),
+    Zone("high penalty region", 25.0, 20.0, 15.0, 15.0, 100.0),
+    Zone("low penalty region", 40.0, 30.0, 25.0, 25.0, 10.0),
 )
 DESIRED = 0.75  # m/s
 STILL = 0.05  # m/s: published threshold of low velocity

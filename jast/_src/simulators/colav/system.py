@@ -17,18 +17,9 @@ from jast import distributions as D
 from jast._src.core.simulator import Simulator
 from jast._src.core.typing import Numeric
 from jast._src.runtime._jax import is_traced
-from jast._src.simulators.colav import planner, tracker
+from jast._src.simulators.colav import planner, tracker, vessels
 from jast._src.simulators.colav.scenarios import SCENARIOS, Scenario
 from jast._src.simulators.colav.tracker import BUFFER, PERIOD, Track
-from jast._src.simulators.colav.vessels import (
-    Adversary,
-    Control,
-    Pose,
-    Velocity,
-    adversary_substep,
-    ferry_substep,
-    world_velocity,
-)
 from jast._src.simulators.parameter import positive
 from jast._src.util.checks import wrong
 
@@ -42,14 +33,14 @@ DOCK = 99.0  # m north: published
 class ColavState(NamedTuple):
     """Both vessels, what the ferry believes and wants, and the last disturbances."""
 
-    pose: Pose
-    velocity: Velocity
-    control: Control
+    pose: vessels.Pose
+    velocity: vessels.Velocity
+    control: vessels.Control
     choice: jax.Array
     """int32: which of `planner.SPEEDS` is commanded."""
     track: Track
     """Where the ferry believes the adversary to be, and its velocity."""
-    adversary: Adversary
+    adversary: vessels.Adversary
     past: jax.Array
     """[16, 4]: the adversary's `Track` at the ends of the last search steps (`tracker`)."""
     step: jax.Array
@@ -217,13 +208,15 @@ def _settled(scenario, dtype):
 def _init(model, x0):
     start = model.scenario
     zero = jnp.zeros((), start.route.dtype)
-    pose, (surge, sway, _) = Pose(*start.ferry), start.route[0]
-    adversary = Adversary(Pose(*start.adversary), Velocity(surge, sway, zero))
+    pose, (surge, sway, _) = vessels.Pose(*start.ferry), start.route[0]
+    adversary = vessels.Adversary(
+        vessels.Pose(*start.adversary), vessels.Velocity(surge, sway, zero)
+    )
     now = _seen(adversary)
     return ColavState(
         pose=pose,
-        velocity=Velocity(zero, zero, zero),
-        control=Control(along=pose.n, speed=zero, sum_n=zero, sum_e=zero, sum_psi=zero),
+        velocity=vessels.Velocity(zero, zero, zero),
+        control=vessels.Control(along=pose.n, speed=zero, sum_n=zero, sum_e=zero, sum_psi=zero),
         choice=jnp.int32(planner.FIRST),
         track=now,
         adversary=adversary,
@@ -258,10 +251,10 @@ def _step(model, s, x):
     dt = PERIOD / n
 
     told = model.scenario.route[s.step]
-    told = Velocity(told[0], told[1], told[2] + steering - 0.5)
+    told = vessels.Velocity(told[0], told[1], told[2] + steering - 0.5)
 
     def sail(adversary, _):
-        adversary = adversary_substep(adversary, told, dt)
+        adversary = vessels.adversary_substep(adversary, told, dt)
         return adversary, adversary.pose
 
     # it minds nobody, so it may go first
@@ -276,7 +269,7 @@ def _step(model, s, x):
         since, adversary = at
         seen = Track(*(a + b for a, b in zip(read(since), noise, strict=True)))
         track = tracker.track(track, seen, dt)
-        pose, velocity, control = ferry_substep(pose, velocity, control, speed, dt)
+        pose, velocity, control = vessels.ferry_substep(pose, velocity, control, speed, dt)
         return (pose, velocity, control, track, jnp.minimum(near, _apart(pose, adversary))), None
 
     start = (s.pose, s.velocity, s.control, s.track, zero + math.inf)
@@ -319,7 +312,7 @@ def _observe(s):
 def _seen(adversary):
     """The adversary's true `Track`."""
     pose, velocity = adversary
-    return Track(pose.n, pose.e, *world_velocity(pose, velocity))
+    return Track(pose.n, pose.e, *vessels.world_velocity(pose, velocity))
 
 
 def _apart(a, b):
