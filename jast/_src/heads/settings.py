@@ -122,16 +122,23 @@ MODES = {"default": DEFAULT, "code": CODE, "text": TEXT, "paper": CODE}
 """"paper" is the earlier name of "code"."""
 
 
-def _whole(value: Any, least: int) -> bool:
-    return isinstance(value, int) and not isinstance(value, bool) and value >= least
+Holds = Callable[[Any], bool]
 
 
-def _number(value: Any, low: float, high: float = math.inf) -> bool:
-    return isinstance(value, Real) and low <= value <= high
+def _whole(least: int) -> Holds:
+    return lambda v: isinstance(v, int) and not isinstance(v, bool) and v >= least
 
 
-def _pair(value: Any, holds: Callable[[Any], bool]) -> bool:
-    return isinstance(value, tuple | list) and len(value) == 2 and all(map(holds, value))
+def _number(low: float, high: float = math.inf) -> Holds:
+    return lambda v: isinstance(v, Real) and low <= v <= high
+
+
+def _several(holds: Holds) -> Holds:
+    return lambda v: isinstance(v, tuple | list) and all(map(holds, v))
+
+
+def _pair(holds: Holds) -> Holds:
+    return lambda v: _several(holds)(v) and len(v) == 2
 
 
 CHOICES = dict(
@@ -143,27 +150,18 @@ CHOICES = dict(
 )
 RULES = {name: (allowed.__contains__, f"one of {allowed}") for name, allowed in CHOICES.items()}
 RULES |= dict(
-    round=(lambda v: v is None or _whole(v, 1), "None or an integer of at least 1"),
-    bins=(lambda v: _whole(v, 2), "an integer of at least 2"),
-    hidden=(
-        lambda v: isinstance(v, tuple | list) and all(_whole(n, 1) for n in v),
-        "integers of at least 1",
-    ),
-    learning_rate=(
-        lambda v: _pair(v, lambda r: _number(r, 0) and r > 0),
-        "a pair of numbers above 0",
-    ),
-    batch=(lambda v: _pair(v, lambda n: _whole(n, 1)), "a pair of integers of at least 1"),
-    steps=(
-        lambda v: _pair(v, lambda n: n is None or _whole(n, 0)),
-        "a pair of integers of at least 0, or None",
-    ),
-    replay=(lambda v: _pair(v, lambda n: _whole(n, 0)), "a pair of integers of at least 0"),
-    elite=(lambda v: _number(v, 0, 1) and v > 0, "above 0 and at most 1"),
-    power=(lambda v: _number(v, 0), "at least 0"),
-    share=(lambda v: _number(v, 0, 1), "from 0 to 1"),
-    q_weight=(lambda v: _number(v, -math.inf), "a number"),
-    v_weight=(lambda v: _number(v, -math.inf), "a number"),
+    round=(lambda v: v is None or _whole(1)(v), "None or an integer of at least 1"),
+    bins=(_whole(2), "an integer of at least 2"),
+    hidden=(_several(_whole(1)), "integers of at least 1"),
+    learning_rate=(_pair(lambda r: _number(0)(r) and r > 0), "a pair of numbers above 0"),
+    batch=(_pair(_whole(1)), "a pair of integers of at least 1"),
+    steps=(_pair(lambda n: n is None or _whole(0)(n)), "a pair of integers of at least 0, or None"),
+    replay=(_pair(_whole(0)), "a pair of integers of at least 0"),
+    elite=(lambda v: _number(0, 1)(v) and v > 0, "above 0 and at most 1"),
+    power=(_number(0), "at least 0"),
+    share=(_number(0, 1), "from 0 to 1"),
+    q_weight=(_number(-math.inf), "a number"),
+    v_weight=(_number(-math.inf), "a number"),
 )
 """Setting -> (what holds for it, in words)."""
 

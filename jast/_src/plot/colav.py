@@ -23,12 +23,11 @@ from jast._src.plot.style import Axes, FuncAnimation
 from jast._src.simulators.colav.planner import SPEEDS, STILL, ZONES
 from jast._src.simulators.colav.system import COLLISION, ColavState
 from jast._src.simulators.colav.tracker import PERIOD
+from jast._src.simulators.svg_states import HULL, placed
 from jast._src.util.checks import number, whole_number
 
 __all__ = ["colav", "colav_animation", "colav_story", "draw_moments", "zone_outline"]
 
-# m ahead and to the right of the centre
-HULL = np.array([(4.0, 0.0), (1.8, 1.5), (-4.0, 1.5), (-4.0, -1.5), (1.8, -1.5)])
 BELIEF, ZONE, DASHED = style.GREEN, style.ORANGE, (0, (3, 1.2))
 SHADES = ((0.30, "-"), (0.16, "--"), (0.07, ":"))  # of `ZONES`: opacity, edge
 
@@ -273,7 +272,7 @@ class _Panel:
             east, north, course = now[2]
             patch.set_xy(zone_outline(zone, north, east, course))
         for patch, here in zip(self.hulls, now, strict=True):
-            patch.set_xy(_place(*HULL.T, *here))
+            patch.set_xy(placed(*HULL.T, *here))
         order = self.log.order[math.floor(t)]
         self.title.set_text(f"t = {t * PERIOD:.0f} s, ordered {order:.2f} m/s")
 
@@ -314,14 +313,7 @@ def zone_outline(zone, n, e, course, points=200):
     angle = np.linspace(0, 2 * np.pi, points)
     ahead = np.cos(angle) * np.where(np.cos(angle) > 0, zone.forward, zone.aft)
     right = np.sin(angle) * np.where(np.sin(angle) > 0, zone.starboard, zone.port)
-    return _place(ahead, right, e, n, course)
-
-
-def _place(ahead, right, east, north, heading):
-    """[points, 2] in (east, north): points ahead and to the right of a place on a heading."""
-    e = east + ahead * np.sin(heading) + right * np.cos(heading)
-    n = north + ahead * np.cos(heading) - right * np.sin(heading)
-    return np.stack([e, n], -1)
+    return placed(ahead, right, e, n, course)
 
 
 def _limits(log, moments):

@@ -20,9 +20,9 @@ from jast._src.simulators.pendulum import PendulumState
 from jast._src.simulators.svg import BLUE, GREEN, GREY, INK, VERMILION
 from jast._src.util.checks import wrong
 
-__all__ = ["DRAWN", "draw"]
+__all__ = ["DRAWN", "HULL", "draw", "placed"]
 
-HULL = ((4.0, 0.0), (1.8, 1.5), (-4.0, 1.5), (-4.0, -1.5), (1.8, -1.5))
+HULL = np.array([(4.0, 0.0), (1.8, 1.5), (-4.0, 1.5), (-4.0, -1.5), (1.8, -1.5)])
 """Ahead and to the right of the centre, drawn larger than a collision so as to be seen."""
 TRAIL = 60  # places of a trail, at most
 
@@ -129,13 +129,18 @@ def _trail(
     return [plane.line([*before[rows], now], colour, opacity=0.5)]
 
 
-def _hull_at(place: tuple[float, float], heading: float) -> list[tuple[float, float]]:
-    """The hull at ``place``, its bow to ``heading`` (radians from up to the right)."""
-    sin, cos = math.sin(heading), math.cos(heading)
-    return [
-        (place[0] + ahead * sin + right * cos, place[1] + ahead * cos - right * sin)
-        for ahead, right in HULL
-    ]
+def placed(ahead: Any, right: Any, east: Any, north: Any, heading: Any) -> np.ndarray:
+    """[points, 2] in (east, north): points ahead and to the right of a place on a heading (radians
+    from north to east).
+    """
+    e = east + ahead * np.sin(heading) + right * np.cos(heading)
+    n = north + ahead * np.cos(heading) - right * np.sin(heading)
+    return np.stack([e, n], -1)
+
+
+def _hull_at(place: svg.Place, heading: float) -> np.ndarray:
+    """The hull at ``place``, its bow to ``heading``."""
+    return placed(*HULL.T, *place, heading)
 
 
 DRAWN = {FerryState: _ferry, ColavState: _colav, PendulumState: _pendulum}
