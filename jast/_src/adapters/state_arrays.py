@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jast._src.runtime._jax import is_traced
 from jast._src.util.pytrees import Key
 
 __all__ = ["as_numbers", "free_to_move", "in_dtypes_of", "refuse_warp", "with_keys"]
@@ -52,7 +53,7 @@ def free_to_move(tree: Any) -> Any:
     """
 
     def free(a: Any) -> Any:
-        put = isinstance(a, jax.Array) and not isinstance(a, jax.core.Tracer) and a.committed
+        put = isinstance(a, jax.Array) and not is_traced(a) and a.committed
         typed = put and jnp.issubdtype(a.dtype, jax.dtypes.prng_key)
         if not put or typed or a.devices() != jnp.zeros(()).devices():
             return a
