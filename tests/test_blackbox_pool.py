@@ -4,6 +4,8 @@ process outlives its simulator.
 
 import gc
 import os
+import resource
+import signal
 import subprocess
 import sys
 import threading
@@ -17,7 +19,7 @@ import pytest
 
 import jast
 from jast import blackbox
-from jast._src.blackbox import pool
+from jast._src.blackbox import pool, worker
 from jast._src.blackbox.pool import Pool
 from jast._src.runtime.host_errors import hosts_of
 from jast.distributions import Normal
@@ -291,6 +293,71 @@ def test_a_worker_that_dies_while_it_has_nothing_to_do_is_replaced():
     time.sleep(0.5)  # until loky knows
     assert ends(sim, [1.5, 0.75]).tolist() == [0.5, 1.25]
     assert before.tolist() == [2.0, 1.0, 1.5, 1.75] and not incidents(sim)
+
+
+class Fragile(blackboxes.Walk):
+    """Raises at 5, and where it is made anew after that."""
+
+    made = 0
+
+    def __init__(self):
+        Fragile.made += 1
+        if Fragile.made > 1:
+            raise RuntimeError("no second object")
+
+    def transition(self, x):
+        self.x = float(x)
+        if self.x == 5:
+            raise RuntimeError("five")
+        if self.x == 9:
+            os._exit(1)
+
+    def is_event(self):
+        return False
+
+    def miss_distance(self):
+        return self.x
+
+
+class OnSmallDisk(Fragile):
+    """Its worker's file of finished rows has room for few."""
+
+    def __init__(self):
+        resource.setrlimit(resource.RLIMIT_FSIZE, (1000, 1000))
+
+
+def asked(pool, first):
+    """Distances of episodes of one disturbance, and what went wrong."""
+    rows = np.asarray(first, float)[:, None]
+    reply = pool(np.ones(len(rows), int), [], [rows], np.arange(len(rows)))
+    return reply.distance, [(i, kind) for i, kind, _ in reply.problems]
+
+
+def alone(system, limit=None):
+    spec = worker.Spec(run=False, episodic=True, horizon=1, x0=(), random=False, limit=limit)
+    return Pool(pool.pack(system, spec), 1, spec, 0, 0)
+
+
+def test_what_a_worker_said_before_is_no_answer():
+    one = alone(Fragile, 1.0)
+    first, problems = asked(one, [1, 2, 5, 6])  # the last one as no object can be made
+    np.testing.assert_array_equal(first, [1, 2, np.nan, np.nan])
+    assert problems == [(2, "raised"), (3, "raised")]
+    (pid,) = one.workers[0].executor._processes
+    os.kill(pid, signal.SIGSTOP)
+    ends = threading.Timer(0.5, os.kill, (pid, signal.SIGKILL))  # before it begins the next
+    ends.start()
+    second, problems = asked(one, [10, 20, 30, 40, 50])
+    assert second.tolist() == [10, 20, 30, 40, 50] and not problems
+    one.workers[0].kill()
+
+
+def test_a_full_disk_costs_answers_of_a_worker_that_ends_and_no_more():
+    one = alone(OnSmallDisk)
+    said, problems = asked(one, [*range(10, 50), 9, 7])
+    np.testing.assert_array_equal(said, [*range(10, 50), np.nan, 7])
+    assert problems == [(40, "died")]
+    one.workers[0].kill()
 
 
 class Broken(blackboxes.Walk):

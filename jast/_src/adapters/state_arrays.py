@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jast._src.runtime._jax import is_traced
+from jast._src.runtime._jax import is_traced, is_tracing
 from jast._src.util.pytrees import Key
 
 __all__ = ["as_numbers", "free_to_move", "in_dtypes_of", "refuse_warp", "with_keys"]
@@ -57,9 +57,11 @@ def free_to_move(tree: Any) -> Any:
         typed = put and jnp.issubdtype(a.dtype, jax.dtypes.prng_key)
         if not put or typed or a.devices() != jnp.zeros(()).devices():
             return a
-        return jnp.asarray(np.asarray(a))
+        new = jnp.asarray(np.asarray(a))
+        same = (new.dtype, new.weak_type) == (a.dtype, a.weak_type)
+        return new if same else a
 
-    return jax.tree.map(free, tree)
+    return tree if is_tracing() else jax.tree.map(free, tree)
 
 
 def refuse_warp(name: str, model: Any, instead: str) -> None:

@@ -3,6 +3,7 @@ hang of one leaves the others alone.
 """
 
 import contextlib
+import io
 import os
 import pickle
 import pkgutil
@@ -100,34 +101,48 @@ class Worker:
 
     def configure(self, x, size):
         """It is to say in a file when what it runs began, and what each row came to."""
-        if self.at is not None:
+        if self.file is not None:
             self.executor.submit(CONFIGURE, x, size)
             return
-        handle, name = tempfile.mkstemp(prefix="jast-")
-        self.file = os.fdopen(handle, "rb")
-        self.at = np.memmap(name, np.float64, "w+", shape=2)
-        self.executor.submit(CONFIGURE, x, size, name).result(timeout=START)
+        self.file = tempfile.NamedTemporaryFile(prefix="jast-", buffering=0, delete=False)
+        self.file.write(bytes(worker.HEAD) + worker.END)
+        self.at = np.memmap(self.file, np.float64, "r+", shape=2)
+        self.executor.submit(CONFIGURE, x, size, self.file.name).result(timeout=START)
         self._forget_file()  # both have it open
+
+    def serve(self, *rows):
+        """A future of the answers of rows, of which the file says nothing yet."""
+        self.at[:] = 0.0, -1.0
+        self.file.seek(worker.HEAD)
+        self.file.write(worker.END)
+        return self.executor.submit(SERVE, *rows)
 
     def finished(self):
         """(place, outcome, problems, episodes, transitions so far) of each row that it has finished
         of what it was given last.
         """
         self.file.seek(worker.HEAD)
-        return list(iter(partial(pickle.load, self.file), None))
+        written, found = io.BytesIO(self.file.read()), []
+        with contextlib.suppress(Exception):  # the last one may be torn
+            for row in iter(partial(pickle.load, written), None):
+                if row[0] != len(found):
+                    break
+                found.append(row)
+        return found
 
     def kill(self):
         executor, self.executor = self.executor, None
         if executor is not None:
             executor.shutdown(wait=False, kill_workers=True)
-        if self.at is not None:
-            self._forget_file()
-            self.file.close()
+        if self.file is not None:
             self.at = None
+            self.file.close()
+            self._forget_file()
+            self.file = None
 
     def _forget_file(self):
         with contextlib.suppress(OSError):  # Windows lets no mapped file go, until its end
-            os.unlink(self.at.filename)
+            os.unlink(self.file.name)
 
 
 def _close(workers):
@@ -180,9 +195,9 @@ class Pool:
         try:
             self._start(self.workers[:1])
             return self.workers[0].executor.submit(PROBE, x0).result(timeout=START)
-        except Exception as error:
+        except BaseException as error:
             self.workers[0].kill()
-            return _cause(error)
+            return _cause(_failure(error))
 
     def judge(self, x0, xs):
         """As `worker.Runner.judge`, in the first worker; neither of all episodes where it gives no
@@ -204,8 +219,9 @@ class Pool:
         self._start(self.workers[:1])
         try:
             return self.workers[0].executor.submit(task, *args).result(timeout=limit)
-        except Exception:
+        except BaseException as error:
             self.workers[0].kill()
+            _failure(error)
 
     def __call__(self, t, x0, xs, lanes):
         """As `worker.Runner`: the `worker.Reply` for n rows; ``lanes`` [n]: their places in the
@@ -228,11 +244,11 @@ class Pool:
                     leaves = [a[rows] for a in x0], [a[rows, :longest] for a in xs]
                     given = time.monotonic()  # before it may begin
                     try:
-                        task = w.executor.submit(SERVE, t[rows], *leaves)
+                        task = w.serve(t[rows], *leaves)
                     except Exception:  # it died while it had nothing to do
                         w.kill()
                         self._start([w])
-                        task = w.executor.submit(SERVE, t[rows], *leaves)
+                        task = w.serve(t[rows], *leaves)
                     busy[task] = _Piece(w, queue, rows, given)
                     free.remove(w)
                 first = min(self._running(piece)[1] for piece in busy.values())
@@ -301,7 +317,7 @@ class Pool:
     def _running(self, piece):
         """Which of its rows runs, None before the first, and when what runs of it must be done."""
         row, began = None, piece.given
-        if piece.worker.at is not None and piece.worker.at[0] > began:
+        if piece.worker.at is not None and piece.worker.at[0] > 0:
             began, row = piece.worker.at.tolist()
             row = int(row)
         return row, began + (self.spec.limit or np.inf) + GRACE
@@ -338,6 +354,13 @@ def _add(reply, episodes, transitions, seconds):
         transitions=reply.transitions + transitions,
         seconds=reply.seconds + seconds,
     )
+
+
+def _failure(error):
+    """``error``, raised again where it is an interruption."""
+    if not isinstance(error, Exception):
+        raise error
+    return error
 
 
 def _cause(error):

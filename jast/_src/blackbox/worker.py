@@ -21,6 +21,7 @@ from typing import NamedTuple
 import numpy as np
 
 __all__ = [
+    "END",
     "METHODS",
     "FAILED",
     "HEAD",
@@ -199,7 +200,6 @@ class Runner:
         one = self._episode if self.spec.episodic else self._step
         if self.finished is not None:
             self.finished.seek(HEAD)
-            self._keep(END)
         for i in range(len(t)):
             self.alarm.row, problem = i, []
             try:
@@ -221,9 +221,11 @@ class Runner:
 
     def _keep(self, written):
         """Write to the file of finished rows; what comes next stands in the place of its end."""
-        with contextlib.suppress(OSError):  # a full disk costs no more than these
-            self.finished.write(written)
-            self.finished.seek(-len(END), os.SEEK_CUR)
+        with contextlib.suppress(OSError):
+            if self.finished.write(written) == len(written):
+                self.finished.seek(-len(END), os.SEEK_CUR)
+                return
+        self.finished = None  # the disk is full: a torn row is not read, and no other is written
 
     def judge(self, x0, xs):
         """[n, 2] bool of whole episodes of objects: whether ``is_event`` holds at a state before

@@ -225,11 +225,13 @@ def _call(name, function, *args):
 
 
 def _line_of_definition(function):
-    """ " (system.py:12)", of a function that was not entered; "" where Python does not know."""
+    """ " (system.py:12)", of a user's function that was not entered; "" where that is unknown."""
     while isinstance(function, partial):
         function = function.func
     code = getattr(function, "__code__", None)
-    return f" ({Path(code.co_filename).name}:{code.co_firstlineno})" if code else ""
+    if code is None or function.__module__.startswith("jast."):
+        return ""
+    return f" ({Path(code.co_filename).name}:{code.co_firstlineno})"
 
 
 def _differ(before, tree):
@@ -404,9 +406,10 @@ def _name(actions):
 
 
 def _raised(error):
-    """What a callback raised: JAX shows it behind the traceback."""
-    lines = str(error).strip().split("\n  ")[-1].splitlines()
-    return (lines[1:] or lines)[0]
+    """What a callback raised: JAX shows it behind the traceback, whose lines are indented."""
+    *_, last = str(error).split('\n  File "')
+    shown = (line for line in last.splitlines()[1:] if line[:1].strip())
+    return next(shown, None) or _first_line(error)
 
 
 def _first_line(error):

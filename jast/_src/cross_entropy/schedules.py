@@ -54,7 +54,7 @@ def geometric(p: float = 0.1, normaliser: Literal["before", "after"] = "before")
         >>> schedules.geometric(0.5)(100, 3)
         (57, 28, 15)
     """
-    number("geometric", "p", p, lambda v: 0 < v < 1, "between 0 and 1")
+    p = number("geometric", "p", p, lambda v: 0 < v < 1, "between 0 and 1")
     one_of("geometric", "normaliser", normaliser, ("before", "after"))
 
     def schedule(budget, iterations):

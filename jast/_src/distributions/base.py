@@ -185,8 +185,10 @@ def parameter_array(name: str, x: Any, low: Any = 0, high: float = np.inf) -> An
     """
     array = float_array(x)
     if not is_traced(array, low):
-        known = np.asarray(array, float)
-        if ((known < np.asarray(low)) | (known > high)).any():
+        dtypes = [a.dtype for a in (array, low) if hasattr(a, "dtype")]
+        coarse = min(dtypes, key=lambda dtype: dtype.itemsize)  # in which equal numbers are equal
+        known = np.asarray(array, coarse)
+        if ((known < np.asarray(low, coarse)) | (known > high)).any():
             words = f"lie between {low} and {high}" if high < np.inf else f"be at least {low}"
             raise ValueError(f"{name} must {words}, received {x}")
     return array

@@ -117,7 +117,9 @@ class Categorical(_Choice):
         self._check(logits, probs, dtype, jnp.integer, jnp.floating)
         self._logits = self._probs = None
         if logits is None:
-            probs = parameter_array("Categorical: probs", jnp.asarray(probs))
+            probs = jnp.asarray(probs)
+            probs = probs.astype(float) if probs.dtype == bool else probs
+            probs = parameter_array("Categorical: probs", probs)
             self._probs = probs / probs.sum(axis=-1, keepdims=True)
         else:
             self._logits = jax.nn.log_softmax(jnp.asarray(logits), axis=-1)

@@ -31,7 +31,7 @@ __all__ = [
 ]
 
 HALF_LOG_2PI = 0.5 * math.log(2 * math.pi)
-LEAST_LOG_TAIL = math.log(sys.float_info.min)  # z = -37.5; of a probability of 0, too
+LEAST_LOG_TAIL = math.log(sys.float_info.min)  # z = -37.5
 ROUNDS = 3  # 1 / z^2 is 6e-3 where they begin in float32
 
 
@@ -172,10 +172,14 @@ def log_one_less(log_p: jax.Array) -> jax.Array:
 
 
 def normal_of_log_tails(log_below: jax.Array, log_above: jax.Array) -> jax.Array:
-    """The z of `log_tails`, from the smaller of the two; finite where one of them is 0."""
-    dtype = log_below.dtype
-    small = jnp.clip(jnp.minimum(log_below, log_above), LEAST_LOG_TAIL, -math.log(2.0))
-    representable = math.log(jnp.finfo(dtype).tiny) + 1  # z = -12.9 in float32, -37.5 in float64
+    """The z of `log_tails`, from the smaller of the two; where that is of a probability of 0, which
+    may have been rounded to it, the z of the least float.
+    """
+    dtype, small = log_below.dtype, jnp.minimum(log_below, log_above)
+    least = math.log(jnp.finfo(dtype).tiny)  # z = -12.9 in float32, -37.5 in float64
+    small = jnp.where(small == -jnp.inf, least, small)
+    small = jnp.clip(small, LEAST_LOG_TAIL, -math.log(2.0))
+    representable = least + 1
     z = ndtri(jnp.exp(jnp.maximum(small, representable)))
     # beyond, log Phi(z) = -z^2 / 2 - log((2 pi)^.5 |z|) + log(1 - 1 / z^2 + 3 / z^4 ...), solved
     # for z^2 by substitution: each round leaves an error 1 / z^2 times that of the last
