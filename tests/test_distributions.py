@@ -96,6 +96,16 @@ def test_quantile_of_a_decreasing_transform(bijector, truth):
     ) == pytest.approx(0.2 if sign > 0 else -0.8, rel=1e-5)
 
 
+def test_parameters_of_two_precisions_and_masks_are_taken():
+    single, double = jnp.float32(0.7), np.array(0.7)
+    for low, high in ((single, double), (double, single)):
+        assert D.Uniform(low, high).high == high
+        assert D.Uniform(low + 1e-4, high + 1).high == high + 1
+        with pytest.raises(ValueError, match="Uniform: high must be at least"):
+            D.Uniform(low + 1, high)
+    assert D.Categorical(probs=jnp.array([True, False, True])).probs.tolist() == [0.5, 0, 0.5]
+
+
 def test_value_errors_name_the_distribution():
     shares = D.Dirichlet(jnp.asarray([2.0, 3.0]))
     with pytest.raises(ValueError, match="quantile: Dirichlet has no quantile function"):

@@ -407,8 +407,8 @@ def _name(actions):
 
 def _raised(error):
     """What a callback raised: JAX shows it behind the traceback, whose lines are indented."""
-    *_, last = str(error).split('\n  File "')
-    shown = (line for line in last.splitlines()[1:] if line[:1].strip())
+    *traceback, last = str(error).split('\n  File "')
+    shown = (line for line in last.splitlines()[1:] if traceback and line[:1].strip())
     return next(shown, None) or _first_line(error)
 
 
