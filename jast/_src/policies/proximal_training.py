@@ -29,16 +29,7 @@ from jast._src.policies.actor import (
 )
 from jast._src.util.pytrees import index_tree
 
-__all__ = [
-    "Batch",
-    "Rates",
-    "advantages",
-    "init_learner",
-    "start_value",
-    "surrogate",
-    "train",
-    "update",
-]
+__all__ = ["Rates", "init_learner", "start_value", "train"]
 
 
 class Rates(NamedTuple):

@@ -36,16 +36,7 @@ from jast._src.io.fingerprint import describe_differences, fingerprint
 from jast._src.runtime.host_errors import hosts_of
 from jast._src.util.pytrees import index_tree
 
-__all__ = [
-    "PARTS",
-    "Checkpoint",
-    "RecordFile",
-    "answer_once",
-    "keep_answers",
-    "open_checkpoint",
-    "read_records",
-    "step_once",
-]
+__all__ = ["Checkpoint", "answer_once", "keep_answers", "open_checkpoint", "step_once"]
 
 PARTS = "parts.log"
 ABOUT = "jast checkpoint"

@@ -34,7 +34,6 @@ from jast._src.util.pytrees import index_tree
 
 __all__ = [
     "EXPLORERS",
-    "Explorer",
     "ExplorerResult",
     "divide_budget",
     "failing_episodes",

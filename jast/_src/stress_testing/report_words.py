@@ -16,9 +16,7 @@ __all__ = [
     "fact_rows",
     "headline",
     "mode_facts",
-    "share_of_runs",
     "shown_failures",
-    "two_digits",
     "verdict_rows",
     "work_rows",
 ]

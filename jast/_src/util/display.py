@@ -19,16 +19,7 @@ from jax.tree_util import Partial
 from jast._src.runtime._jax import is_traced
 from jast._src.util.pytrees import fields_of
 
-__all__ = [
-    "VOCABULARY",
-    "Former",
-    "call_settings",
-    "batch_shape",
-    "html_table",
-    "renamed",
-    "result_class",
-    "printable",
-]
+__all__ = ["Former", "call_settings", "html_table", "renamed", "result_class", "printable"]
 
 VOCABULARY = {
     "episodes": "runs of the system, each counted once",
