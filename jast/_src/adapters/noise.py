@@ -1,7 +1,5 @@
 """What is random in one place of a loop, and what a draw does there."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any, NamedTuple
 

@@ -1,7 +1,5 @@
 """What an environment returns as what a state of a `Simulator` may hold, and back."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import jax

@@ -4,8 +4,6 @@ A position of 4.6e6 m in float32 moves in steps of half a metre: what pushes it 
 at every step, and so is the probability of where it ends.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from jast._src.core.probe import Resolution, probe

@@ -1,7 +1,5 @@
 """The mean of independent repetitions, and how far it is to be believed."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from typing import NamedTuple

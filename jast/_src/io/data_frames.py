@@ -1,7 +1,5 @@
 """Results as tables of pandas and data sets of xarray, which are imported when one is made."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from typing import Any
 

@@ -2,8 +2,6 @@
 of their own, as nodes of `io.codec`.
 """
 
-from __future__ import annotations
-
 import itertools
 from typing import Any, NamedTuple
 

@@ -5,8 +5,6 @@ What all of jast's files have in common. All arrays are NumPy's: they keep their
 precision that JAX is set to.
 """
 
-from __future__ import annotations
-
 import hashlib
 import io
 import json

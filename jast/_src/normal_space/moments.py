@@ -4,8 +4,6 @@ A simulator says at every state how far it is from failing, so one run tells as 
 the episode has moments: it fails if any of them does.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -5,8 +5,6 @@ Shared by the search `jast.search.cem`, the objective of `jast.cross_entropy.ove
 `jast.estimate.failure_proposal`.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import jax

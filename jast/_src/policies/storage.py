@@ -2,8 +2,6 @@
 simulator's functions are not in them.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import jax

@@ -11,8 +11,6 @@ needs shared memory, which network file systems do not have, or a lock that keep
 checksums, parts above 1 GB and the comparison of calls would be ours all the same.
 """
 
-from __future__ import annotations
-
 import contextlib
 import contextvars
 import hashlib

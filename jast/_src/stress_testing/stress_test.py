@@ -1,7 +1,5 @@
 """One stress test: the pieces of its work, what each of them found, and what it cost."""
 
-from __future__ import annotations
-
 import warnings
 from pathlib import Path
 from typing import NamedTuple

@@ -7,8 +7,6 @@ are constant where an episode fails). Rows and ratios are joined by generalised 
 covariance comes from the failures: those of a row serve its own answer and both of its ratios.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from statistics import NormalDist

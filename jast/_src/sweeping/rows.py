@@ -1,7 +1,5 @@
 """The rows of a sweep: where they run, and what a checkpoint keeps of them."""
 
-from __future__ import annotations
-
 import inspect
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path

@@ -4,8 +4,6 @@ They are fitted by cross-entropy to the failures of all batches: one mixture for
 for each mode, or Gaussians that differ from the model in a few numbers.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple

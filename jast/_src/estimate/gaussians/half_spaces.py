@@ -7,8 +7,6 @@ Gaussian of the model's mean and variance beyond its plane, with a wide copy, an
 tell by how much those of a system that is not linear are spread more widely.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Any, NamedTuple
 

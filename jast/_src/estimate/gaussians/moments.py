@@ -2,8 +2,6 @@
 of the episode and side, each from the system linearised near to its own boundary.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from jast._src.estimate.gaussians import half_spaces

@@ -2,8 +2,6 @@
 better (de Boer, Kroese, Mannor and Rubinstein 2005).
 """
 
-from __future__ import annotations
-
 from jast._src.estimate.gaussians.mixture_fit import effective_sample_size
 from jast._src.estimate.proposal_search.search_state import (
     Family,

@@ -2,8 +2,6 @@
 not fitted to. It absorbs what they find, or that becomes a reason against the estimate.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Any, NamedTuple
 

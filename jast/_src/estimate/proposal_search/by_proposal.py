@@ -4,8 +4,6 @@ Two families of proposals are tried, mixtures of Gaussians and tilts of each ste
 where they begin, and in how they are fitted; the search is the same.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from typing import Any, NamedTuple

@@ -6,8 +6,6 @@ rise, so nobody branches earlier. That is one state a step of each path, in plac
 disturbances and a second simulation up to the branching.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple

@@ -1,7 +1,5 @@
 """The levels of adaptive multilevel splitting: who is killed, and from whom it goes on."""
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple, Protocol
 

@@ -1,7 +1,5 @@
 """Whether the objects of a black box can be saved and resumed, tried before the runs."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import jax

@@ -2,8 +2,6 @@
 resumed there. Disturbances are drawn on the device, for all lanes of a batch at once.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any, NamedTuple
 

@@ -5,8 +5,6 @@ rare, nothing may lead to a failure: half of the first batch is of a model whose
 raised (failure biasing, Shahabuddin 1994). Failures that came with the call are taken in.
 """
 
-from __future__ import annotations
-
 import math
 from functools import partial
 from typing import Any, NamedTuple
