@@ -24,21 +24,21 @@ class Lead(NamedTuple):
     """[B] float: its reward; -inf before there is one."""
     source: jax.Array
     """[B] int32: 1 + its simulation."""
-    on: Any
+    on: jax.Array | tuple[()]
     """[B] bool: the next simulation goes straight to ``node`` and takes there what the best episode
     took.
     """
-    node: Any
+    node: jax.Array | tuple[()]
     """[B] int32: the last node on the path of that episode."""
-    depth: Any
+    depth: jax.Array | tuple[()]
     """[B] int32: its level."""
-    reward: Any
+    reward: jax.Array | tuple[()]
     """[B] float: from the start up to it."""
-    trail: Any
+    trail: jax.Array | tuple[()]
     """[H + 1, B] int32: nodes from the first root to it."""
-    path: Any
+    path: jax.Array | tuple[()]
     """[H, B] int32: edges to it, as places in the tree's edges."""
-    fed: Any
+    fed: jax.Array | tuple[()]
     """[S + 1, B, words] uint32: what the rollout of each simulation is fed: whether there is
     anything, and the packed disturbance.
     """

@@ -25,17 +25,17 @@ class Edges(NamedTuple):
     i.
     """
 
-    seen: Any
+    seen: jax.Array
     """[S, B, n] what networks see of s."""
-    x: Any
+    x: jax.Array
     """[S, B, d] the disturbance."""
-    visits: Any
+    visits: jax.Array
     """[S, B] N(s, a)."""
-    q: Any
+    q: jax.Array
     """[S, B] Q(s, a)."""
-    parent_q: Any
+    parent_q: jax.Array
     """[S, B] Q of the edge that leads to s, 0 at the first root: the published target."""
-    valid: Any
+    valid: jax.Array
     """[S, B] bool: there is such an edge."""
 
 

@@ -3,7 +3,6 @@ term of eq. 3.
 """
 
 from dataclasses import dataclass, field
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -11,7 +10,7 @@ import numpy as np
 
 from jast import distributions as D
 from jast._src.distributions.flat_rows import flat, unflat
-from jast._src.heads.heads import observation, policy_logits, predicted_value, sample_bins
+from jast._src.heads.heads import Heads, observation, policy_logits, predicted_value, sample_bins
 from jast._src.util.pytrees import select
 
 __all__ = ["Guide", "child_value", "guide", "rolled"]
@@ -26,17 +25,16 @@ _HEAD = np.uint32(1)  # address apart from that of what is drawn without heads
 class Guide:
     """Heads in a search; the numbers are traced."""
 
-    heads: Any
-    """`jast.heads.Heads`."""
-    power: Any
+    heads: Heads
+    power: jax.Array
     """A bin is drawn with probability proportional to p^power."""
-    q_weight: Any
+    q_weight: jax.Array
     """Of Q(s, a) where there is a value head."""
-    v_weight: Any
+    v_weight: jax.Array
     """c2 of MCFS-AP eq. 3."""
-    share: Any
+    share: jax.Array
     """Of the rollouts that the policy head draws."""
-    levels: Any
+    levels: jax.Array
     """The first levels of an episode, at which the policy head draws."""
     eager: bool = field(default=False, metadata=dict(static=True))
     """Whether a node's unvisited children are all that widening allows, or one at a time."""

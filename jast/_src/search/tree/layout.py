@@ -64,16 +64,16 @@ _NODE = np.uint32(1 << 31)  # addresses of children, apart from those of simulat
 class Settings(NamedTuple):
     """The real-valued settings of a search, all traced."""
 
-    exploration: Any
+    exploration: jax.Array
     """c1 of MCFS-AP eq. 3."""
-    widths: Any
+    widths: jax.Array
     """[simulations + 2] int32: the number of children of a node by its visits."""
 
 
 class Problem(NamedTuple):
     """What a tree search is about: pytrees, each shared by all trees or with a leading axis [B]."""
 
-    sim: Any
+    sim: Simulator
     reward: Any
     choice: Any
     """`search.tree.settings.Choice`."""
@@ -116,7 +116,7 @@ class Tree(NamedTuple):
     gather from a large array over threads, which for so few numbers costs more than it saves,
     unless the gather ends in an update in place.
     """
-    values: Any
+    values: jax.Array | tuple[()]
     """[pages * B * (PAGE + 1)] float: v(s, a) of each child, rows as in ``edges``; ``()`` without a
     value head.
     """
@@ -159,7 +159,7 @@ class Tree(NamedTuple):
     """[S, B] uint8: `outcome_of` each simulation."""
     lead: Any
     """`Lead`, the best episode of each tree, or ``()`` where the search makes no use of it."""
-    trials: Any
+    trials: jax.Array | tuple[()]
     """[S, 2, B] float: miss distance and true log p of the episode of each simulation; ``()`` where
     they are not recorded.
     """
@@ -178,11 +178,11 @@ class Node(NamedTuple):
     invalid: jax.Array
     state: Any
     """The simulator's state, or ``()`` where states are not kept at nodes."""
-    source: Any = ()
+    source: jax.Array | tuple[()] = ()
     """int32: 1 + the simulation whose rollout took the action that led here, 0: it is the slot's
     own; ``()`` without `Choice.follow`.
     """
-    log_prob: Any = ()
+    log_prob: jax.Array | tuple[()] = ()
     """From the start up to here; ``()`` where trials are not recorded."""
 
 

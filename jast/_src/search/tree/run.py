@@ -19,9 +19,9 @@ from jast._src.runtime.backends import Task, UnitContext
 from jast._src.runtime.memory import size
 from jast._src.runtime.progress_bar import Watch
 from jast._src.search.tree import simulate
-from jast._src.search.tree.edges import branches_of, edges_of
+from jast._src.search.tree.edges import Branches, Edges, branches_of, edges_of
 from jast._src.search.tree.layout import Problem, flags, make
-from jast._src.search.tree.prune import prune, recounted
+from jast._src.search.tree.prune import Roots, prune, recounted
 from jast._src.search.tree.rebuild import rebuild
 from jast._src.util.pytrees import index_tree
 
@@ -63,7 +63,7 @@ class TreeBatch(NamedTuple):
     """[S, B] `search.tree.layout.outcome_of` each simulation."""
     steps: np.ndarray
     """[B] simulator steps."""
-    roots: Any
+    roots: Roots
     """`Roots` with a leading axis [prunes], zeros from where all trees of the group are at their
     end.
     """
@@ -72,11 +72,11 @@ class TreeBatch(NamedTuple):
     tree: np.ndarray
     """[n] where they were found."""
     simulation: np.ndarray
-    edges: Any = ()
+    edges: Edges | tuple[()] = ()
     """`Edges`, where the plan asks for them."""
-    trials: Any = ()
+    trials: np.ndarray | tuple[()] = ()
     """[S, 2, B] distance and log p of each simulation's episode, where the plan asks for them."""
-    branches: Any = ()
+    branches: Branches | tuple[()] = ()
     """`Branches`, where the plan asks for them."""
 
 

@@ -1,6 +1,6 @@
 """Selection: from the root down to a child that was never visited, or to an episode's end."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -50,11 +50,11 @@ class Walk(NamedTuple):
     desk: jax.Array
     scores: jax.Array
     below: jax.Array
-    values: Any
+    values: jax.Array | tuple[()]
     """Desk of the pages' v(s, a), ``()`` without a value head; so are the next two."""
-    last: Any
+    last: jax.Array | tuple[()]
     """[H, B] last page's row of the path's nodes."""
-    new: Any
+    new: jax.Array | tuple[()]
     """[H, B] the slot that will be new at the next visit, or 0 (the first child needs no value
     while it is alone).
     """

@@ -102,13 +102,13 @@ class F16(NamedTuple):
 class Controls(NamedTuple):
     """What moves the aircraft."""
 
-    throttle: Any
+    throttle: jax.Array
     """0 to 1"""
-    elevator: Any
+    elevator: jax.Array
     """degrees"""
-    aileron: Any
+    aileron: jax.Array
     """degrees"""
-    rudder: Any
+    rudder: jax.Array
     """degrees"""
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -61,11 +61,11 @@ class Model:
     """
 
     scenario: Scenario
-    longest: Any
-    change: Any
-    easing: Any
-    swing: Any
-    noise: Any
+    longest: jax.Array
+    change: jax.Array
+    easing: jax.Array
+    swing: jax.Array
+    noise: jax.Array
     kinds: tuple = field(metadata=dict(static=True))
     substeps: int = field(metadata=dict(static=True))
 

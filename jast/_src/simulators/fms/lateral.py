@@ -9,7 +9,7 @@ which is not where it was built to start: it is then longer or shorter than stat
 point lies past its own end it leads nearly all the way round (a fifth of the failures).
 """
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -30,17 +30,17 @@ LEAST = 1e-3  # m: a turn shorter than that is none
 class Build(NamedTuple):
     """Settings of the path builder, scalars."""
 
-    eps: Any
+    eps: jax.Array
     """Legs shorter than that (m) skip the fit; 0: none does, the correct builder."""
-    every: Any
+    every: jax.Array
     """bool: the guard acts on every such leg, not only where the turns at its ends have opposite
     senses.
     """
-    bank: Any
+    bank: jax.Array
     """Bank angle (radians)."""
-    tas: Any
+    tas: jax.Array
     """True air speed (m/s)."""
-    snap: Any
+    snap: jax.Array
     """bool: an arc that would start before the last one ended is made to start at that end, which
     keeps the path connected.
     """

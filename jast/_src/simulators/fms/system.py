@@ -5,7 +5,7 @@ distances for users and pictures.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -49,7 +49,7 @@ class Model:
     and which event (static).
     """
 
-    build: Any
+    build: Build
     waypoints: int = field(metadata=dict(static=True))
     event: str = field(metadata=dict(static=True))
 
