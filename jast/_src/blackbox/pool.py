@@ -317,7 +317,7 @@ class Pool:
     def _running(self, piece):
         """Which of its rows runs, None before the first, and when what runs of it must be done."""
         row, began = None, piece.given
-        if piece.worker.at is not None and piece.worker.at[0] > 0:
+        if piece.worker.at[0] > 0:
             began, row = piece.worker.at.tolist()
             row = int(row)
         return row, began + (self.spec.limit or np.inf) + GRACE

@@ -14,7 +14,7 @@ from jax.tree_util import Partial
 from jast._src.core.typing import Disturbance, Evaluate, Init, IsTerminal, Observe, Start, Step
 from jast._src.distributions.containers import accepted
 from jast._src.util import display
-from jast._src.util.checks import wrong
+from jast._src.util.checks import truth_value, wrong
 from jast._src.util.pytrees import as_partial, traceable, with_strong_types
 from jast.distributions import Fixed
 
@@ -148,8 +148,7 @@ class Simulator:
             object.__setattr__(self, "horizon", int(self.horizon))
         if isinstance(self.horizon, bool) or not isinstance(self.horizon, int) or self.horizon < 1:
             raise wrong("Simulator", "horizon", "be an int of at least 1", f"{self.horizon!r}")
-        if not isinstance(self.episodic, bool):
-            raise wrong("Simulator", "episodic", "be True or False", f"{self.episodic!r}")
+        truth_value("Simulator", episodic=self.episodic)
 
 
 # each is traced once, for all programs with the system in them

@@ -117,8 +117,7 @@ def attribution(
         3
     """
     name = "attribution"
-    if method not in METHODS:
-        raise ValueError(f"{name}: method must be one of {sorted(METHODS)}, received {method!r}")
+    checks.one_of(name, "method", method, sorted(METHODS))
     permutations = checks.whole_number(name, "permutations", permutations, 2)
     key = jax.random.key(0) if key is None else key
     checks.check_random_key(name, key)

@@ -184,8 +184,7 @@ def monitor(
         budget = checks.whole_number(name, "budget", budget, 1)
     rate = checks.number(name, "false_alarms", false_alarms, lambda v: 0 <= v <= 1, "from 0 to 1")
     level = checked_level(name, level)
-    if model not in MODELS:
-        raise ValueError(f"{name}: model must be one of {sorted(MODELS)}, received {model!r}")
+    checks.one_of(name, "model", model, sorted(MODELS))
     first, second = jax.random.split(key)
     e, owner, group, spent = _episodes(name, first, sim, failures, others, episodes, budget)
     seen = observations(name, sim, sim.observe if observe is None else observe, e)

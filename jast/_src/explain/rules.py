@@ -174,8 +174,7 @@ def rules(
     if budget is not None:
         budget = checks.whole_number(name, "budget", budget, 1)
     level = checked_level(name, level)
-    if of not in OF:
-        raise ValueError(f"{name}: of must be one of {OF}, received {of!r}")
+    checks.one_of(name, "of", of, OF)
     first, second, third = jax.random.split(key, 3)
     number = isinstance(others, int | np.integer) and not isinstance(others, bool)
     if others is None or number:
