@@ -151,6 +151,53 @@ def test_the_gradient_of_the_likelihood_is_that_of_its_differences():
     np.testing.assert_allclose(value(logs)[1], by_differences, rtol=1e-4, atol=1e-5)
 
 
+def test_what_two_coordinates_do_together_becomes_an_axis():
+    """A wave across the diagonal of the first two of four coordinates: after two turns an axis lies
+    along it, the wave's length is read off that axis alone, and errors are a tenth.
+    """
+    across = np.array([1.0, -1.0, 0.0, 0.0]) / np.sqrt(2)
+    wave = lambda z: 4.0 + np.sin(1.5 * z @ across) + 0.2 * z[:, 2]
+    rng = np.random.default_rng(0)
+    z, new, none = rng.standard_normal((80, 4)), rng.standard_normal((400, 4)), np.zeros(80, bool)
+    straight = fitted = surrogate.fit(z, wave(z), none)
+    for _ in range(2):
+        straight = surrogate.fit(z, wave(z), none, straight)
+        fitted = surrogate.fit(z, wave(z), none, surrogate.turned(fitted))
+    shortest = fitted.axes[np.argmax(fitted.logs[3:])]
+    assert abs(shortest @ across) > 0.99
+    assert fitted.evidence > straight.evidence + 20
+    truth = wave(new) / wave(z).std()
+    errors = [np.abs(surrogate.predict(s, new)[0] - truth).mean() for s in (straight, fitted)]
+    assert errors[1] < 0.1 * errors[0]
+
+
+def test_axes_say_nothing_where_all_lengthscales_are_equal():
+    """A process that is the same in all directions is the same along other axes."""
+    z, y, failing = _data()
+    z, y = z[~failing], y[~failing]
+    data = z, y, np.zeros(len(z), bool)
+    s = surrogate.fit(*data)
+    s = surrogate.fit(*data, s._replace(logs=np.r_[s.logs[:3], [-0.5] * 3]), rounds=0)
+    other = surrogate.turned(s)
+    assert np.abs(other.axes - np.eye(3)).max() > 0.1
+    np.testing.assert_allclose(other.axes @ other.axes.T, np.eye(3), atol=1e-12)
+    np.testing.assert_allclose(other.logs, s.logs, atol=1e-12)
+    other = surrogate.fit(*data, other, rounds=0)
+    new = np.random.default_rng(1).standard_normal((50, 3))
+    for a, b in zip(surrogate.predict(s, new), surrogate.predict(other, new), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-6)
+    a, b = (surrogate.posterior_covariance(each, new) for each in (s, other))
+    np.testing.assert_allclose(a, b, atol=1e-6)
+    sd = surrogate.predict(s, new)[1]
+    np.testing.assert_allclose(np.sqrt(np.diagonal(a)), sd, rtol=1e-6)
+
+
+def test_one_coordinate_has_one_axis():
+    z, y = np.linspace(-1, 1, 9)[:, None], np.linspace(2, 1, 9) ** 2
+    s = surrogate.fit(z, y, np.zeros(9, bool))
+    assert abs(surrogate.turned(s).axes) == [[1.0]]
+
+
 def test_the_sites_of_one_failure_match_the_moments_of_a_half_normal():
     k, failing = np.array([[4.0]]), np.array([True])
     tau, nu = surrogate._fit_sites(k, np.array([1e-6]), np.zeros(1), failing, 0.0)

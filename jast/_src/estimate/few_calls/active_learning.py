@@ -19,10 +19,11 @@ from jast._src.core.signature import signature_of
 from jast._src.core.simulator import Simulator
 from jast._src.estimate.few_calls.surrogate import (
     Surrogate,
-    covariance,
     fit,
+    posterior_covariance,
     predict,
     probability_below_zero,
+    turned,
 )
 from jast._src.estimate.few_calls.surrogate_pool import DOUBT, Pool, expected, pool
 from jast._src.estimate.gaussians.mixture_fit import nearest_centre
@@ -106,17 +107,21 @@ class Learner:
         self.invalid = np.concatenate([self.invalid, invalid | ~np.isfinite(distance)])
 
     def fit(self, with_warp: bool) -> None:
-        """Fit the surrogate to what was seen; ``with_warp``: with the choice of its warp."""
+        """Fit the surrogate to what was seen, along the axes of the last one or those of its slopes;
+        ``with_warp``: with the choice of its warp.
+        """
         rows = np.flatnonzero(~self.invalid)[:HELD]
         hidden = self.failing[rows] & ~_depths(self.z[rows], self.distance[rows])
         data = self.z[rows], self.distance[rows], hidden
-        if not with_warp and self.surrogate is not None:
-            self.surrogate = fit(*data, self.surrogate, self.surrogate.warp, rounds=1)
-            return
-        safe = self.distance[rows][~self.failing[rows]]
-        middle = float(np.median(safe)) if len(safe) else 0.0
-        warps = [math.inf, *(middle * w for w in WARPS if middle > 0)]
-        tried = [fit(*data, self.surrogate, warp) for warp in warps]
+        before = self.surrogate
+        starts = [None] if before is None else [before, turned(before)]
+        if before is None or with_warp:
+            safe = self.distance[rows][~self.failing[rows]]
+            middle = float(np.median(safe)) if len(safe) else 0.0
+            warps = [math.inf, *(middle * w for w in WARPS if middle > 0)]
+            tried = [fit(*data, start, warp) for start in starts for warp in warps]
+        else:
+            tried = [fit(*data, start, before.warp, rounds=1) for start in starts]
         self.surrogate = max(tried, key=lambda surrogate: surrogate.evidence)
 
     def draw_pool(self, n: int, anew: bool = True) -> None:
@@ -190,8 +195,7 @@ def _least_doubt(learner, n):
     mean, _ = predict(surrogate, z)
     # posterior covariances among them; what is known after a call at one of them falls by their
     # squares, whatever its outcome
-    k = covariance(z, surrogate.z, surrogate.logs)[0]
-    c = covariance(z, z, surrogate.logs)[0] - k @ surrogate.inverse @ k.T
+    c = posterior_covariance(surrogate, z)
     rounding = ROUNDING * float(np.exp(surrogate.logs[:2]).sum() + 1)
     noise, chosen = surrogate.noise + rounding, []
     for _ in range(n):

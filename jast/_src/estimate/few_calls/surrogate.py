@@ -5,15 +5,24 @@ On the host, in double precision. Distances are observed values, failures withou
 ones) are half-lines; Gaussian sites stand for these by expectation propagation (Minka 2001;
 Rasmussen and Williams 2006, Gaussian processes for machine learning, ch. 3.6), so that predictions
 are those of a regression. The covariance has a constant and a linear part, and Matern 5/2 with a
-lengthscale for each coordinate; hyperparameters climb the likelihood with the sites held.
+lengthscale for each axis; hyperparameters climb the likelihood with the sites held. The axes are
+those along which the slope of a process fitted before varies most (active subspaces, Constantine
+2015, of the slope less its mean): what two coordinates do together is one of them.
 """
 
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-__all__ = ["Surrogate", "covariance", "fit", "predict", "probability_below_zero"]
+__all__ = [
+    "Surrogate",
+    "fit",
+    "posterior_covariance",
+    "predict",
+    "probability_below_zero",
+    "turned",
+]
 
 ROUNDS = 2  # hyperparameters and sites are fitted in turn; a round costs `ASCENTS` inverses
 ASCENTS = 8  # steps of the hyperparameters in a round
@@ -62,11 +71,13 @@ class Surrogate(NamedTuple):
     scaled. On the host.
     """
 
-    z: np.ndarray
-    """[n, D]"""
+    points: np.ndarray
+    """[n, D] along the axes"""
+    axes: np.ndarray
+    """[D, D]: an orthonormal axis a row"""
     logs: np.ndarray
     """[3 + D] logarithms: the variances of the constant, the linear part and the noise, relative to
-    that of the Matern part, and 1 / lengthscale of each coordinate"""
+    that of the Matern part, and 1 / lengthscale along each axis"""
     weights: np.ndarray
     """[n]: the inverse times the targets"""
     inverse: np.ndarray
@@ -100,8 +111,11 @@ def fit(
     rounds: int = ROUNDS,
 ) -> Surrogate:
     """The `Surrogate` of points ``z`` [n, D] with ``distance`` [n] where not ``hidden`` [n], which
-    failed without saying how deep; ``before``: one of the first of them, to start from.
+    failed without saying how deep; ``before``: one of the first of them, to start from, whose axes
+    it has.
     """
+    axes = np.eye(z.shape[1]) if before is None else before.axes
+    z = z @ axes.T
     seen = ~hidden
     size = np.abs(distance)
     t = distance if math.isinf(warp) else np.sign(distance) * warp * np.log1p(size / warp)
@@ -115,7 +129,7 @@ def fit(
         for new, old in zip((tau, nu), before.sites, strict=True):
             new[: len(old)] = old
     for i in range(rounds + 1):
-        noise, k = math.exp(logs[2]), covariance(z, z, logs)[0]
+        noise, k = math.exp(logs[2]), _covariance(z, z, logs)[0]
         tau, nu = np.where(hidden, tau, 1 / noise), np.where(hidden, nu, t / noise)
         tau, nu = _fit_sites(k, tau, nu, hidden, noise)
         if i < rounds:
@@ -126,7 +140,8 @@ def fit(
     log_slope = 0.0 if math.isinf(warp) else np.log1p(size[seen] / warp).sum()
     value -= log_slope + seen.sum() * math.log(scale)
     return Surrogate(
-        z=z,
+        points=z,
+        axes=axes,
         logs=logs,
         weights=inverse @ (nu / tau),
         inverse=inverse,
@@ -139,16 +154,38 @@ def fit(
 def predict(surrogate: Surrogate, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Mean and standard deviation [m] of the scaled limit state at ``z`` [m, D]."""
     constant, linear, _ = np.exp(surrogate.logs[:3])
+    z = z @ surrogate.axes.T
     mean, explained = np.empty(len(z)), np.empty(len(z))
     for i in range(0, len(z), BLOCK):
-        k, _ = covariance(z[i : i + BLOCK], surrogate.z, surrogate.logs)
+        k, _ = _covariance(z[i : i + BLOCK], surrogate.points, surrogate.logs)
         mean[i : i + BLOCK] = k @ surrogate.weights
         explained[i : i + BLOCK] = ((k @ surrogate.inverse) * k).sum(axis=1)
     own = constant + linear * (z**2).sum(axis=1) + 1.0
     return mean, np.sqrt(np.maximum(own - explained, LEAST_VARIANCE))
 
 
-def covariance(a: np.ndarray, b: np.ndarray, logs: np.ndarray) -> tuple[np.ndarray, Any]:
+def posterior_covariance(surrogate: Surrogate, z: np.ndarray) -> np.ndarray:
+    """[m, m] of the scaled limit state at ``z`` [m, D]."""
+    z = z @ surrogate.axes.T
+    k, _ = _covariance(z, surrogate.points, surrogate.logs)
+    return _covariance(z, z, surrogate.logs)[0] - k @ surrogate.inverse @ k.T
+
+
+def turned(surrogate: Surrogate) -> Surrogate:
+    """What to start from with other axes: the eigenvectors of the covariance of its slopes, and the
+    lengthscales as they were along these.
+    """
+    z, scale = surrogate.points, np.exp(surrogate.logs[3:])
+    _, (r, e) = _covariance(z, z, surrogate.logs)
+    # of Matern 5/2 by z_i: -5/3 (1 + r) e^-r (z_i - z'_i) / lengthscale_i^2
+    by = -(5 / 3) * (1 + r) * e * surrogate.weights
+    slopes = (by.sum(axis=1)[:, None] * z - by @ z) * scale**2
+    _, columns = np.linalg.eigh(np.atleast_2d(np.cov(slopes.T)))
+    logs = np.concatenate([surrogate.logs[:3], 0.5 * np.log(scale**2 @ columns**2)])
+    return surrogate._replace(axes=columns.T @ surrogate.axes, logs=logs)
+
+
+def _covariance(a, b, logs):
     """[n, m] of the points ``a`` [n, D] and ``b`` [m, D], and what its derivatives need."""
     constant, linear, _ = np.exp(logs[:3])
     x, y = a * np.exp(logs[3:]), b * np.exp(logs[3:])
@@ -235,7 +272,7 @@ def _climb(z, target, extra, hidden, logs, prior):
 def _likelihood(z, target, extra, hidden, logs):
     """Log likelihood of the targets and its gradient (R&W eq. 2.30 and 5.9)."""
     constant, linear, noise = np.exp(logs[:3])
-    k, (r, e) = covariance(z, z, logs)
+    k, (r, e) = _covariance(z, z, logs)
     matrix = _with_noise(k, np.where(hidden, extra, noise))
     inverse = np.linalg.inv(matrix)
     alpha = inverse @ target

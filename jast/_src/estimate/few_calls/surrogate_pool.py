@@ -69,7 +69,7 @@ def pool(
     """`Pool` of ``n`` points, and the parts [(share, `Gaussians`), ...] fitted on the way:
     ``before`` of the next one. ``anew``: with a population.
     """
-    d = surrogate.z.shape[1]
+    d = surrogate.points.shape[1]
     wide = unit_gaussians(np.zeros((1, d)))
     wide = wide._replace(values=wide.values * (WIDE_FEW if d <= FEW_NUMBERS else WIDE_MANY))
     always = [(OF_WIDE, wide)]
@@ -101,7 +101,7 @@ def plausible(rng: np.random.Generator, surrogate: Surrogate) -> np.ndarray | No
         mean, deviation = predict(surrogate, z)
         return mean - PLAUSIBLE * deviation
 
-    z, scale = rng.standard_normal((POPULATION, surrogate.z.shape[1])), FIRST_SCALE
+    z, scale = rng.standard_normal((POPULATION, surrogate.points.shape[1])), FIRST_SCALE
     scores = score(z)
     for _ in range(LEVELS):
         level = max(float(np.quantile(scores, QUANTILE)), 0.0)
