@@ -74,6 +74,7 @@ class Learner:
         self.steps, self.spent = 0, 0
         self.sure, self.surprises = 0, 0  # calls where no failure was expected; those that failed
         self.plain = (0, 0, 0)  # (failing, invalid, calls) of draws of the model
+        self.fits: list[Surrogate] = []
         self.surrogate: Surrogate | None = None
         self.fitted: list | None = None
         self.pool: Pool | None = None
@@ -107,22 +108,21 @@ class Learner:
         self.invalid = np.concatenate([self.invalid, invalid | ~np.isfinite(distance)])
 
     def fit(self, with_warp: bool) -> None:
-        """Fit the surrogate to what was seen, along the axes of the last one or those of its slopes;
-        ``with_warp``: with the choice of its warp.
+        """Fit surrogates to what was seen, one along the coordinates and one along axes that turn
+        with each fit, and keep the better; ``with_warp``: with the choice of their warps.
         """
         rows = np.flatnonzero(~self.invalid)[:HELD]
         hidden = self.failing[rows] & ~_depths(self.z[rows], self.distance[rows])
         data = self.z[rows], self.distance[rows], hidden
-        before = self.surrogate
-        starts = [None] if before is None else [before, turned(before)]
-        if before is None or with_warp:
+        starts = [self.fits[0], turned(self.fits[-1])] if self.fits else [None]
+        if with_warp or not self.fits:
             safe = self.distance[rows][~self.failing[rows]]
             middle = float(np.median(safe)) if len(safe) else 0.0
             warps = [math.inf, *(middle * w for w in WARPS if middle > 0)]
-            tried = [fit(*data, start, warp) for start in starts for warp in warps]
+            self.fits = [_likeliest(fit(*data, start, w) for w in warps) for start in starts]
         else:
-            tried = [fit(*data, start, before.warp, rounds=1) for start in starts]
-        self.surrogate = max(tried, key=lambda surrogate: surrogate.evidence)
+            self.fits = [fit(*data, start, start.warp, rounds=1) for start in starts]
+        self.surrogate = _likeliest(self.fits)
 
     def draw_pool(self, n: int, anew: bool = True) -> None:
         """Draw ``n`` points of the model around the failures that the surrogate expects."""
@@ -154,6 +154,11 @@ def choose_calls(learner: Learner) -> None:
         f"learning: {learner.spent} calls, {int(learner.failing.sum())} failures,"
         f" {int(learner.invalid.sum())} invalid"
     )
+
+
+def _likeliest(surrogates):
+    """The one of the greatest evidence."""
+    return max(surrogates, key=lambda surrogate: surrogate.evidence)
 
 
 def _depths(z, distance):

@@ -87,7 +87,8 @@ class Surrogate(NamedTuple):
     warp: float
     """inf: none"""
     evidence: float
-    """Log probability of the distances and failures, times the prior of ``logs``"""
+    """Log probability of the distances and failures, times the prior of ``logs``; of other axes
+    than the coordinates less log(n) / 2 for each of their angles (Schwarz 1978)"""
 
     @property
     def noise(self) -> float:
@@ -114,7 +115,8 @@ def fit(
     failed without saying how deep; ``before``: one of the first of them, to start from, whose axes
     it has.
     """
-    axes = np.eye(z.shape[1]) if before is None else before.axes
+    n, d = z.shape
+    axes = np.eye(d) if before is None else before.axes
     z = z @ axes.T
     seen = ~hidden
     size = np.abs(distance)
@@ -122,9 +124,9 @@ def fit(
     values = t[seen] if seen.any() else np.ones(1)
     scale = max(float(values.std()), 0.1 * float(np.abs(values).mean()), 1e-300)
     t = np.where(hidden, 0.0, t / scale)
-    prior = _prior(z.shape[1])
+    prior = _prior(d)
     logs = prior.mean if before is None else before.logs
-    tau, nu = np.where(hidden, UNSEEN_PRECISION, 1.0), np.zeros(len(z))
+    tau, nu = np.where(hidden, UNSEEN_PRECISION, 1.0), np.zeros(n)
     if before is not None:
         for new, old in zip((tau, nu), before.sites, strict=True):
             new[: len(old)] = old
@@ -139,6 +141,8 @@ def fit(
     # densities of the distances themselves: the derivative of the warp and the scale
     log_slope = 0.0 if math.isinf(warp) else np.log1p(size[seen] / warp).sum()
     value -= log_slope + seen.sum() * math.log(scale)
+    if (axes != np.eye(d)).any():
+        value -= d * (d - 1) / 2 * math.log(n) / 2
     return Surrogate(
         points=z,
         axes=axes,
