@@ -532,6 +532,23 @@ def test_the_default_selector_says_how_rough_its_expectation_is():
     assert np.isnan(result._replace(state=none).at_most)
 
 
+def test_a_bound_that_every_input_may_reach_is_not_told():
+    """Of 40 inputs that were not run at most 40 fail: that is no news. A bound of 39 is told."""
+    inputs, labels, answers = problem(60)
+    result = validate(KEY, System(answers), inputs, labels, budget=20)
+
+    def bounded(at_most):
+        """The result whose random calls bound the failures left by ``at_most``."""
+        share = 0.5
+        known = (at_most + result.failing) * share - np.log(20) / -np.expm1(-1.5)
+        memory = result.state.memory | dict(shares=np.array([share, known, 0.0]))
+        return result._replace(state=result.state._replace(memory=memory))
+
+    few, all_of_them = bounded(39.0), bounded(41.0)
+    assert few.at_most == pytest.approx(39) and all_of_them.at_most == 40
+    assert "at most 39 in 95 %" in str(few) and "at most" not in str(all_of_them)
+
+
 GOOD = np.zeros((6, 2)), np.array([0, 1, 2, 0, 1, 2])
 
 
