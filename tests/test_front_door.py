@@ -92,6 +92,23 @@ def test_a_failing_plain_draw_is_kept(key):
     assert jast.nominal(key, walk(limit=50.0), 50).first is None
 
 
+@pytest.mark.slow
+def test_failures_that_only_the_estimate_draws_cost_each_draw_once():
+    """No distance leads to a tail of .001, and with key 0 no search meets it. Failures are drawn in
+    batches of a twentieth of the budget, here of one, and those that fail are played again.
+    """
+    sim = jast.Simulator(
+        init=lambda x0: jnp.zeros(()),
+        step=lambda s, x: x,
+        disturbance=lambda s: Normal(jnp.zeros(()), jnp.ones(())),
+        evaluate=lambda s: (s > 3.09, jnp.where(s > 3.09, 0.0, 1.0)),
+        horizon=1,
+    )
+    report = jast.stress(jax.random.key(0), sim, 300)
+    (drawn,) = (t for t in report.tried if t.name == "the estimate's failures")
+    assert drawn.failing > 0 and drawn.evaluations == 300 // 20 + drawn.failing
+
+
 @pytest.mark.long
 def test_slow_steps_cross_from_basin_to_basin(key):
     """A relay controller whose likeliest failure swings first: -6.56 is the best of ten searches by
