@@ -285,7 +285,7 @@ def _area_interval(rng, score, soon, rows, group, level) -> tuple[float, float]:
     bins = np.searchsorted(edges, score[rows])
     each = np.broadcast_to(group[:, None], score.shape)[rows]
     names, at = np.unique(each, return_inverse=True)
-    counts = np.zeros((2, len(names), len(edges) + 1))
+    counts = np.zeros((2, len(names), len(edges)))
     np.add.at(counts, (soon[rows].astype(int), at, bins), 1)
     times = rng.multinomial(len(names), np.full(len(names), 1 / len(names)), REPEATS)
     no, yes = times @ counts[0], times @ counts[1]
