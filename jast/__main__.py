@@ -32,8 +32,8 @@ from jast._src.util.pytrees import index_tree
 from jast.explain import cards
 from jast.stress_testing import stress
 
-STANDARD = rewards.standard(event_bonus=30.0, density="mode")
-OF_FERRY = STANDARD, actions.uniform(0.0, 1.0)
+STANDARD = rewards.standard(event_bonus=30.0, density="mode")  # published for the ferry
+OF_FERRY = STANDARD, actions.uniform(0.0, 1.0)  # x is in [0, 1]
 SYSTEMS = {  # name: the simulator, the reward and the actions of a search
     "ferry": (simulators.ferry, *OF_FERRY),
     "ferry-b": (partial(simulators.ferry, adversary=(17.0, 0.0)), *OF_FERRY),

@@ -17,8 +17,8 @@ from jast._src.util.checks import one_of, real_number, truth_value, whole_number
 
 __all__ = ["MODES", "check_objective", "make_plan"]
 
-PLAIN = dict(elitism=(False, True))
-SURROGATE = PLAIN | dict(
+PLAIN = dict(elitism=(False, True))  # of `ce_method`; a line as in `MIXTURE`
+SURROGATE = PLAIN | dict(  # of `ce_surrogate`; "thesis" is the published code
     memory=(3, 3),
     best=(0, 10),
     evaluated=(0.0, 0.1),

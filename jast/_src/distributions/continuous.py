@@ -16,9 +16,7 @@ from jast._src.distributions.base import Elementwise, broadcast, float_array, pa
 from jast._src.distributions.normal import Symmetric
 from jast._src.distributions.tables import numbers
 
-__all__ = ["LOG_2", "Beta", "Gamma", "Laplace", "Logistic", "Uniform", "log_power"]
-
-LOG_2 = math.log(2.0)
+__all__ = ["Beta", "Gamma", "Laplace", "Logistic", "Uniform", "log_power"]
 
 
 class Laplace(Symmetric):
@@ -36,7 +34,7 @@ class Laplace(Symmetric):
         return self.loc[None] + self.scale[None] * jax.random.laplace(key, **self._like_n(n))
 
     def log_prob(self, value: Any) -> Array:
-        return -jnp.abs(self._standardize(value)) - LOG_2 - jnp.log(self._scale)
+        return -jnp.abs(self._standardize(value)) - math.log(2.0) - jnp.log(self._scale)
 
     def stddev(self) -> Any:
         return math.sqrt(2.0) * self.scale

@@ -1,5 +1,7 @@
 """The rows of the families that distrax has, too: each serves both classes of its name."""
 
+import math
+
 import jax
 import jax.numpy as jnp
 from jax.scipy.special import expit, log_ndtr, logit
@@ -15,8 +17,6 @@ from jast._src.distributions.normal_tails import (
     ndtri,
     standard,
 )
-
-LOG_2 = continuous.LOG_2
 
 
 def _quantile_laplace(d, u):
@@ -35,11 +35,15 @@ def _normal_of_laplace(d, x):
     return -jnp.sign(v) * ndtri(jnp.exp(-jnp.abs(v)) / 2)
 
 
+def _laplace_of_normal(d, z):
+    return d.loc - d.scale * jnp.sign(z) * (math.log(2.0) + log_ndtr(-jnp.abs(z)))
+
+
 register_both(
     continuous.Laplace,
     quantile=_quantile_laplace,
     cdf=_cdf_laplace,
-    from_normal=lambda d, z: d.loc - d.scale * jnp.sign(z) * (LOG_2 + log_ndtr(-jnp.abs(z))),
+    from_normal=_laplace_of_normal,
     to_normal=_normal_of_laplace,
 )
 

@@ -32,7 +32,7 @@ __all__ = [
 ]
 
 FORMAT = "jast result"
-VERSION = 1
+VERSION = 1  # of `FORMAT`; a file of another one is refused
 FORMATS = {FORMAT: VERSION} | former_files.FORMATS
 KIND = "a file of jast.save"
 

@@ -26,6 +26,7 @@ EVALUATED = EDGE | dict(marker="o", markersize=5, color="white", markeredgewidth
 ELITES = EDGE | dict(marker="D", markersize=5.5, color=style.ORANGE, zorder=6)
 JUDGED = EDGE | dict(marker=".", markersize=6, color=style.ORANGE, markeredgewidth=0.5, zorder=4)
 BEST = EDGE | dict(marker="*", markersize=13, color=style.VERMILION, zorder=7)
+"""Marks, and the edge of all: the fewer there are of a kind, the higher it lies. A convention."""
 DEVIATIONS = {1: "-", 2: style.DASHED}  # lines of the ellipses
 SHADES = ("#2F70A6", "#7FAFD3", "#BFD7E9", "#EDF2F6")
 

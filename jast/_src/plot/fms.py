@@ -24,7 +24,7 @@ from jast._src.simulators.fms.system import fms_path
 __all__ = ["fms"]
 
 POINTS = 181  # on an arc
-LEGS = dict(color=style.GREY, linewidth=0.9, linestyle=style.DASHED, zorder=2)
+LEGS = dict(color=style.GREY, linewidth=0.9, linestyle=style.DASHED, zorder=2)  # below the path
 QUESTIONED = dict(color=style.VERMILION, linewidth=2.6)  # the arc in question
 UNITS = {"arc length": "", "kink": " rad", "disconnection": " ft", "course": " rad"}
 

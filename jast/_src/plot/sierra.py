@@ -19,6 +19,7 @@ SIDE = 15.0  # the picture reaches from -15 to 15, as the figure
 POINTS = 161  # of a side
 LEVELS = 24  # of colour
 PUBLISHED = tuple((sharpness, decay) for decay in (1.0, 0.0) for sharpness in (0.5, 2.0, 6.0))
+"""The panels of figure 2.1."""
 
 
 def sierra(

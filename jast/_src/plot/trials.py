@@ -20,7 +20,7 @@ from jast._src.util.checks import one_of
 __all__ = ["trial_distances", "trials"]
 
 POINTS = 2000  # of a line: more than a picture has pixels
-HORIZON = dict(color=style.INK, linewidth=1, linestyle="--", label="event horizon")
+HORIZON = dict(color=style.INK, linewidth=1, linestyle="--", label="event horizon")  # at 0
 
 
 def trials(

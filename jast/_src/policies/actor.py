@@ -39,7 +39,7 @@ more.
 """
 
 
-LOG_2PI = math.log(2 * math.pi)
+LOG_2PI = math.log(2 * math.pi)  # of the normal density
 
 
 def log_normal(z: jax.Array, mean: jax.Array, deviation: jax.Array) -> jax.Array:

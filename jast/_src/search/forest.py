@@ -19,7 +19,7 @@ from jast._src.search.tree.settings import PLAIN
 
 __all__ = ["MODES", "forest"]
 
-CODE = PLAIN | dict(widening=(0.5, 0.6))
+CODE = PLAIN | dict(widening=(0.5, 0.6))  # as published
 MODES = {
     "default": PLAIN | dict(widening=(2.0, 0.5), spread=True, focus=None),
     "code": CODE,

@@ -17,6 +17,7 @@ from jast._src.search.tree.forest_run import grow_trees
 __all__ = ["MODES", "mcts"]
 
 MODES = FOREST_MODES | dict(default=FOREST_MODES["default"] | dict(widening=(1.0, 0.5)))
+"""Those of `forest`; a single root has half as many children by default."""
 
 
 def mcts(key: PRNGKey, sim: Simulator, **settings: Any) -> SearchResult:

@@ -46,7 +46,7 @@ DAMPING = np.stack(list(_TABLES["damping"].values()), axis=-1)
 LIFT = _TABLES["lift"]
 PITCHING = _side_by_side("pitching") / 1000
 """[12, 5, 2]: CX and Cm, by the elevator at -24, -12, .. 24 degrees."""
-_RIGHT = _side_by_side("slipping") / 1000
+_RIGHT = _side_by_side("slipping") / 1000  # at 0, 5, .. 30 degrees; odd in the sideslip
 SLIPPING = np.concatenate([0 - _RIGHT[:, :0:-1], _RIGHT], axis=1)
 """[12, 13, 2]: Cl and Cn, by a sideslip of -30, -25, .. 30 degrees."""
 STEERING = _side_by_side("steering") / 1000

@@ -57,10 +57,10 @@ STAGES = np.array([[0, 1 / 6], [0.5, 1 / 3], [0.5, 1 / 3], [1, 1 / 6]])
 """Of Runge-Kutta's method: how far along the last slope each is, and its weight."""
 
 # benchmarks.f16_design: level flight at 502 ft/s, and the gains about it
-LEVEL_ALPHA = 0.0369109
-THROTTLE = 0.138535
-ELEVATOR = -0.758780
-PITCH = np.array([-280.2576, -69.8972, -57.735])
+LEVEL_ALPHA = 0.0369109  # rad
+THROTTLE = 0.138535  # from 0 to 1
+ELEVATOR = -0.758780  # degrees
+PITCH = np.array([-280.2576, -69.8972, -57.735])  # of alpha, q, the error of load
 LATERAL = np.array([[27.9123, -3.2968, -16.1738, -17.9932, -9.7869],
                     [8.6686, 1.1445, -49.1969, 3.0949, -56.8995]])  # fmt: skip
 

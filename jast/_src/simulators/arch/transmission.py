@@ -57,7 +57,7 @@ FINAL = 3.23  # ratio of the final drive
 FRICTION = 40.0  # ft lb
 DRAG = 0.02  # ft lb, for the square of each mph
 MPH = 2 * math.pi * 60 / 5280  # of a wheel's rpm
-GEARS = np.array([2.393, 1.45, 1.0, 0.677])
+GEARS = np.array([2.393, 1.45, 1.0, 0.677])  # their ratios
 
 
 def _evenly_spaced(step: float, at: Any, values: Any) -> np.ndarray:

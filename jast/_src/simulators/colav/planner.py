@@ -28,7 +28,7 @@ class Zone(NamedTuple):
     weight: float
 
 
-ZONES = (
+ZONES = (  # published; the weight of the first is ours
     Zone("region of collision", 20.0, 10.0, 10.0, 10.0, 1000.0),
     Zone("high penalty region", 25.0, 20.0, 15.0, 15.0, 100.0),
     Zone("low penalty region", 40.0, 30.0, 25.0, 25.0, 10.0),
@@ -37,7 +37,7 @@ DESIRED = 0.75  # m/s
 STILL = 0.05  # m/s: published threshold of low velocity
 # candidates, m/s: published range
 SPEEDS = np.concatenate([[-0.2, 0.0], np.linspace(0.15, 1.5, 10)])
-FIRST = int(np.flatnonzero(np.isclose(SPEEDS, DESIRED))[0])
+FIRST = int(np.flatnonzero(np.isclose(SPEEDS, DESIRED))[0])  # in force at the start
 STEP = 2.0  # s: of the prediction: ours
 AHEAD = 30.0  # s: its end: ours (published: up to 600)
 SLOWNESS = 10.0  # cost of a second at 1 m/s off the desired speed
