@@ -8,7 +8,7 @@ that are drawn once an episode change.
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple, TypeAlias
 
@@ -22,7 +22,7 @@ from jast._src.adapters.noise import Random, disturbed, model_of, random, replac
 from jast._src.adapters.state_arrays import as_numbers, free_to_move, in_dtypes_of, with_keys
 from jast._src.core.check import OBSERVED
 from jast._src.core.simulator import Simulator, fixed, ravel
-from jast._src.core.typing import Array, DistributionLike
+from jast._src.core.typing import Array, DistributionLike, Numeric
 from jast._src.util.checks import wrong
 from jast._src.util.pytrees import as_partial
 
@@ -68,8 +68,8 @@ class Outcome(NamedTuple):
 
     state: Any
     observation: Any
-    reward: Any
-    terminated: Any
+    reward: Numeric | Mapping[Any, Numeric]
+    terminated: Array | bool
 
 
 @jax.tree_util.register_dataclass

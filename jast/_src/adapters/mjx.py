@@ -39,7 +39,7 @@ class _Physics:
     """The model"""
     data: Any
     sense: Partial
-    advance: Any = field(metadata=dict(static=True))
+    advance: Callable[[Any, Any], Any] = field(metadata=dict(static=True))
     substeps: int = field(metadata=dict(static=True))
 
     def reset(self, key: Any) -> closed_loop.Outcome:

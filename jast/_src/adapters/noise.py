@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jax.tree_util import Partial
 
 from jast import distributions as D
+from jast._src.core.typing import DistributionLike
 from jast._src.util.checks import wrong
 from jast._src.util.pytrees import as_partial
 
@@ -19,7 +20,7 @@ PAIR = "a pair (distribution, function (it, draw) -> it)"
 class Random(NamedTuple):
     """What is random in one place, and what a draw does there."""
 
-    model: Any
+    model: DistributionLike | Callable[[Any], DistributionLike]
     """A distribution, or a function of the `Instant` that returns one"""
     apply: Partial | None
     """(it, draw) -> it; None: the draw is added"""

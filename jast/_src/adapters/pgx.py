@@ -13,6 +13,7 @@ from jax.tree_util import Partial
 from jast._src.adapters import closed_loop
 from jast._src.adapters.closed_loop import Instant
 from jast._src.core.simulator import Simulator
+from jast._src.core.typing import Array
 
 __all__ = ["pgx"]
 
@@ -21,8 +22,8 @@ class _Turn(NamedTuple):
     """What the player who is to move knows."""
 
     observation: Any
-    legal_action_mask: Any
-    current_player: Any
+    legal_action_mask: Array
+    current_player: Array
 
 
 @jax.tree_util.register_dataclass

@@ -96,7 +96,7 @@ class Quantiles(_OfTheModel):
 
     numbers: tuple[Any, ...] = ()
     """The leaves of the proposal."""
-    kind: Any = field(default=None, metadata=dict(static=True))
+    kind: jax.tree_util.PyTreeDef | None = field(default=None, metadata=dict(static=True))
     """Its structure, or None without one."""
 
     @property
@@ -134,8 +134,8 @@ class UniformBox:
         0.25
     """
 
-    low: Any
-    high: Any
+    low: ArrayTree
+    high: ArrayTree
     places_start = False
     focus = 0.2  # a box knows nothing of the model
 
@@ -234,7 +234,7 @@ class Wide(_OfTheModel):
         6.0
     """
 
-    width: Any = None
+    width: Numeric | None = None
     places_start = True
     focus = 0.3  # wide noise is far from the mode, and less so than a box
 

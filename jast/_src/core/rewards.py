@@ -67,7 +67,7 @@ class Standard:
         49.0
     """
 
-    event_bonus: Any = 0.0
+    event_bonus: Numeric = 0.0
     density: str = field(**_density)
 
     def __call__(
@@ -88,7 +88,7 @@ class Episodic:
         -3.0
     """
 
-    bonus: Any = 100.0
+    bonus: Numeric = 100.0
     density: str = field(**_density)
     mode: str = field(default="default", metadata=dict(static=True))
 
@@ -117,8 +117,8 @@ class Shaped:
         0.0
     """
 
-    scale: Any = 1.0
-    event_bonus: Any = 0.0
+    scale: Numeric = 1.0
+    event_bonus: Numeric = 0.0
     density: str = field(**_density)
 
     def __call__(
@@ -160,9 +160,9 @@ class Lexicographic:
         (False, True)
     """
 
-    near: Any = None
-    rare: Any = None
-    likely: Any = 0.0
+    near: Numeric | None = None
+    rare: Numeric | None = None
+    likely: Numeric = 0.0
     density: str | None = field(default=None, metadata=dict(static=True))
 
     once = True

@@ -11,6 +11,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from jast import distributions as D
 from jast._src.core.simulator import Simulator, first_state
@@ -61,7 +62,7 @@ class Signature:
     x: Any
     """Of the disturbance of a step."""
     state: Any
-    dtype: Any = field(**_static)
+    dtype: np.dtype = field(**_static)
     """The float dtype in which an episode's numbers are summed: the widest of the disturbance's log
     density and the distance.
     """

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
+from jast._src.core.typing import ArrayTree
 from jast._src.heads.networks import adam, adam_step
 from jast._src.heads.samples import Samples
 
@@ -19,8 +20,8 @@ __all__ = ["HeadState", "Lesson", "init_head", "train_head"]
 class HeadState(NamedTuple):
     """A head in training."""
 
-    params: Any
-    optimiser: Any
+    params: ArrayTree
+    optimiser: ArrayTree
     """Adam's state."""
     kept: Samples | None
     """The latest samples, up to the capacity."""

@@ -15,6 +15,7 @@ from jax.tree_util import Partial
 
 from jast._src.core.policy import Policy
 from jast._src.core.simulator import Simulator
+from jast._src.core.typing import ArrayTree
 from jast._src.distributions.mixtures import Blended
 from jast._src.heads.heads import observation
 from jast._src.policies.actor import Normalisation, latent_mixture, network_inputs
@@ -61,9 +62,9 @@ class History(NamedTuple):
 class Learned(NamedTuple):
     """All that was learned, as arrays."""
 
-    actor: Any
+    actor: ArrayTree
     """Parameters: the latents' mixture from what is observed; of `q_learning` the `Table`."""
-    critic: Any
+    critic: ArrayTree
     """Parameters: of `sac` those of two, stacked in front."""
     net: Normalisation
     tilt: Tilt | tuple[()]

@@ -16,6 +16,7 @@ import jax.numpy as jnp
 from jax import lax
 
 from jast._src.core.simulator import Simulator
+from jast._src.core.typing import ArrayTree
 from jast._src.heads.networks import adam, adam_step
 from jast._src.policies import training_state
 from jast._src.policies.actor import (
@@ -49,8 +50,8 @@ class Rates(NamedTuple):
 class Learner(NamedTuple):
     """All that is learned."""
 
-    actor: Any
-    critic: Any
+    actor: ArrayTree
+    critic: ArrayTree
     """V of the networks' inputs."""
     log_alpha: jax.Array
     optimiser: tuple[Any, Any]

@@ -15,6 +15,7 @@ import jax.numpy as jnp
 from jax import lax
 
 from jast._src.core.simulator import Simulator
+from jast._src.core.typing import ArrayTree
 from jast._src.heads.networks import adam, adam_step
 from jast._src.policies import training_state
 from jast._src.policies.actor import (
@@ -56,12 +57,12 @@ class Rates(NamedTuple):
 class Learner(NamedTuple):
     """All that is learned."""
 
-    actor: Any
-    critic: Any
+    actor: ArrayTree
+    critic: ArrayTree
     """Two, stacked in front."""
-    target: Any
+    target: ArrayTree
     """Their running averages."""
-    average: Any
+    average: ArrayTree
     """The actor's: what is handed out."""
     log_alpha: jax.Array
     optimiser: tuple[Any, Any, Any]

@@ -10,6 +10,7 @@ from jast._src.core import rewards
 from jast._src.core.episode import Episode
 from jast._src.core.signature import signature_of
 from jast._src.core.simulator import Simulator
+from jast._src.core.typing import ArrayTree
 from jast._src.search.driver import Log, finish
 from jast._src.search.lanes import Played, blank_episodes, distinct_episodes, take_rows
 from jast._src.search.result import SearchResult
@@ -34,7 +35,7 @@ class BestEpisodes(NamedTuple):
     """[K] int32: which episode of the search was the first of these disturbances."""
     count: jax.Array
     """[K] int32: how often they were found."""
-    mark: Any = ()
+    mark: ArrayTree = ()
     """[K, ...]: what a search wants to know of them."""
 
     @classmethod

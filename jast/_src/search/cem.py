@@ -65,7 +65,7 @@ class Elites(NamedTuple):
 
     episode: Episode
     """[K]; reward -inf where there are fewer."""
-    latent: Any
+    latent: tuple[Any, Any] | tuple[()]
     """z of (x0, x): leaves [K, 1, ...] and [K, horizon, ...]; ``()`` where they are copied."""
     tag: jax.Array
     number: jax.Array
@@ -213,14 +213,14 @@ class _Search:
     """A `search.driver.Search`."""
 
     sim: Simulator
-    reward: Any
+    reward: Reward
     top: int
     keys: jax.Array
     """[trees]"""
-    actions: Any
+    actions: Actions
     shares: Shares
     plan: Plan
-    around: Any
+    around: tuple[Any, Any] | tuple[()]
     record: bool
 
     def init(self) -> State:

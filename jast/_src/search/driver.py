@@ -18,7 +18,7 @@ import numpy as np
 from jast._src.core import failures as archive
 from jast._src.core.episode import Episode, replay
 from jast._src.core.simulator import Simulator
-from jast._src.core.typing import Callback, PathLike
+from jast._src.core.typing import Callback, PathLike, Reward
 from jast._src.runtime._jax import is_traced, is_tracing
 from jast._src.runtime.checkpoints import keep_answers, open_checkpoint, step_once
 from jast._src.runtime.host_errors import (
@@ -54,7 +54,7 @@ class Search(Protocol[State]):
     """A search as the driver takes it: what does not change while it runs, and three methods."""
 
     sim: Simulator
-    reward: Any
+    reward: Reward
     top: int
     """Distinct failures that the result keeps."""
 

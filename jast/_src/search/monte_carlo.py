@@ -6,7 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -192,8 +192,8 @@ class Job(NamedTuple):
 
     key: jax.Array
     sim: Simulator
-    reward: Any
-    actions: Any
+    reward: Reward
+    actions: Actions
     top: int
     nothing: Found
     """What each begins with."""

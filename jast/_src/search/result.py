@@ -11,6 +11,8 @@ import numpy as np
 
 from jast._src.core.episode import Episode
 from jast._src.core.failures import Failures
+from jast._src.core.typing import Array
+from jast._src.heads.heads import Heads
 from jast._src.io.data_frames import dataframe
 from jast._src.search.refine.refine import Refined
 from jast._src.util import display
@@ -30,11 +32,11 @@ class History(NamedTuple):
         True
     """
 
-    simulations: Any
+    simulations: np.ndarray
     """[C] int: episodes simulated by each tree so far."""
-    best_reward: Any
+    best_reward: np.ndarray
     """[C, trees] float: reward of each tree's best episode so far (failures before all others)."""
-    failing: Any
+    failing: np.ndarray
     """[C] int: failing episodes so far, over all trees."""
 
     @property
@@ -49,19 +51,19 @@ class Trials(NamedTuple):
     were simulated.
     """
 
-    reward: Any
+    reward: Array
     """float; -inf where the episode was invalid."""
-    distance: Any
+    distance: Array
     """float: miss distance; inf where the episode was invalid."""
-    log_prob: Any
+    log_prob: Array
     """float: true log density of the disturbances."""
-    failure: Any
+    failure: Array
     """bool."""
-    ran: Any
+    ran: Array
     """bool: it was simulated; a search tree that comes to an episode's end again has its outcome
     already.
     """
-    repeated: Any = None
+    repeated: Array | None = None
     """bool: a failure that a tree came to again, which ``failure`` counts once; None in files of
     versions that did not keep it.
     """
@@ -100,28 +102,28 @@ class SearchResult(NamedTuple):
     """The best episode: the failure of the highest reward, or the episode of the highest reward
     where none failed; of equal ones the first that was found. With its states.
     """
-    best_reward_per_tree: Any
+    best_reward_per_tree: Array
     """[trees] float: reward of each tree's best episode, likewise; -inf where the simulator
     returned no finite number.
     """
     failures: Failures | None
     """The archive: the best distinct failures, replayed (`jast.failures`)."""
-    episodes: Any
+    episodes: Array | int
     """int: episodes simulated."""
-    steps: Any
+    steps: Array | int
     """int: calls of ``step``; an episode that starts from a kept state costs only its new steps."""
-    first_failure: Any
+    first_failure: Array | int | None
     """int: how many episodes were simulated up to and including the first that failed, or None (-1
     when traced).
     """
-    failing_share: Any
+    failing_share: Array | float
     """float: share of the simulated episodes that failed. The share of the trees is
     ``failing_trees``.
     """
-    failing_per_tree: Any
+    failing_per_tree: Array
     """[trees] bool: whether the tree found a failure."""
     history: History | None
-    invalid: Any
+    invalid: Array | int
     """int: episodes in which the simulator, a density or the reward gave NaN or infinity; they
     count as no failure, with reward -inf.
     """
@@ -129,7 +131,7 @@ class SearchResult(NamedTuple):
     """What was asked for: method, counts, seed."""
     roots: Any = None
     """Of trees: statistics of every root (`search.tree.prune.Roots`, one for each prune)."""
-    heads: Any = None
+    heads: Heads | None = None
     """`jast.heads.Heads` as the search left them, to be used again; None without."""
     trials: Trials | None = None
     """Every episode, where the search was asked to ``record``."""
@@ -139,7 +141,7 @@ class SearchResult(NamedTuple):
     """
     lessons: tuple[Any, ...] = ()
     """Of each round of training: name of the head -> `jast.heads.Lesson`."""
-    failing: Any = None
+    failing: Array | int | None = None
     """int: how many of the episodes failed."""
     refined: Refined | None = None
     """What came of the search's failures by `jast.search.refine`, scored by log p relative to the
@@ -150,7 +152,7 @@ class SearchResult(NamedTuple):
     """The trees themselves (`search.tree.edges.Branches`), where the search was asked to
     ``keep_trees``: for `jast.plot.tree`.
     """
-    misses: Any = None
+    misses: Episode | None = None
     """Of trees: the best episodes that do not fail, of trees that found no failure, one a tree, at
     most ``top`` of them by falling reward: an `Episode` with a leading axis, without states.
     """

@@ -60,7 +60,7 @@ class _Watch:
 
     sim: Simulator
     formula: Formula
-    samples: Any
+    samples: Partial | None
     dt: float = field(metadata=dict(static=True))
     total: int = field(metadata=dict(static=True))
 

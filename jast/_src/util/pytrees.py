@@ -32,7 +32,7 @@ __all__ = [
 class Key(NamedTuple):
     """A typed random key as numbers, which is what a state may hold."""
 
-    data: Any
+    data: jax.Array
 
 
 def with_strong_types(tree: Any) -> Any:
@@ -62,7 +62,7 @@ class _WithFunctions:
     """A function, and the functions among the leaves of its arguments; equal where these are."""
 
     function: Callable
-    static: Any
+    static: tuple[Any, Any]
     """(args, keywords) with None where JAX traces."""
 
     def __call__(self, args: tuple, keywords: dict, *more: Any) -> Any:

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import json
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import numpy as np
 
-from jast._src.core.typing import Array
+from jast._src.core.typing import Array, ArrayTree
 from jast._src.util import display
 from jast._src.weakness import networks
 from jast._src.weakness.data import data_of_result
@@ -41,9 +41,9 @@ class Encoded(NamedTuple):
     """[n]: A(E(x)), how suspect the adversary finds each input, in [0, 1]"""
     shape: tuple[int, ...]
     """Of an input"""
-    autoencoder: Any
+    autoencoder: ArrayTree
     """Parameters"""
-    adversary: Any
+    adversary: ArrayTree
     """Parameters"""
     hidden: tuple[int, ...]
     """The autoencoder's widths"""

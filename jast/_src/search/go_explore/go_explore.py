@@ -23,7 +23,7 @@ from jast._src.core.episode import Episode
 from jast._src.core.rewards import as_pytree
 from jast._src.core.signature import signature_of
 from jast._src.core.simulator import Simulator, require_simulator
-from jast._src.core.typing import Callback, PathLike, PRNGKey
+from jast._src.core.typing import Callback, PathLike, PRNGKey, Reward
 from jast._src.runtime import memory
 from jast._src.runtime.host_errors import runs_on_host
 from jast._src.search.best_episodes import BestEpisodes, standard_reward
@@ -175,7 +175,7 @@ class _Search:
     """A `search.driver.Search`."""
 
     sim: Simulator
-    reward: Any
+    reward: Reward
     top: int
     key: jax.Array
     cell: Callable | None

@@ -12,7 +12,16 @@ from jast._src.core.simulator import Simulator
 from jast._src.search.tree.packing import unpack, width
 from jast._src.util.pytrees import select
 
-__all__ = ["fed_of", "fed_source", "feed_level", "follows", "no_lead", "take_fed", "update_lead"]
+__all__ = [
+    "Lead",
+    "fed_of",
+    "fed_source",
+    "feed_level",
+    "follows",
+    "no_lead",
+    "take_fed",
+    "update_lead",
+]
 
 
 class Lead(NamedTuple):

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jax import lax
 
 from jast._src.core.signature import signature_of
+from jast._src.core.typing import Array
 from jast._src.distributions.flat_rows import flat
 from jast._src.heads.heads import observation
 from jast._src.search.tree.best_episode import fed_source
@@ -72,7 +73,7 @@ class Branches(NamedTuple):
     number i + 1, and the edge that leads to it; the first root has number 0.
     """
 
-    parent: Any
+    parent: Array
     """[S, B] int32: the number of the node that it is a child of."""
     start: Any
     """[S, B, ...] its x0, which is the choice at the first root of a system with a random start;
@@ -80,17 +81,17 @@ class Branches(NamedTuple):
     """
     x: Any
     """[S, B, ...] its disturbance; at the first root of a random start it means nothing."""
-    visits: Any
+    visits: Array
     """[S, B] int32: N(s, a), 0 where there is no such node."""
-    q: Any
+    q: Array
     """[S, B] float: Q(s, a)."""
-    end: Any
+    end: Array
     """[S, B] bool: an episode ends there."""
-    distance: Any
+    distance: Array
     """[S, B] float: miss distance up to there."""
-    reward: Any
+    reward: Array
     """[S, B] float: of the episode of the simulation that made it."""
-    failure: Any
+    failure: Array
     """[S, B] bool: that episode failed."""
 
 

@@ -30,9 +30,10 @@ from jast._src.core.rewards import once
 from jast._src.core.signature import signature_of
 from jast._src.core.simulator import Simulator, never
 from jast._src.core.transition import advance, begin, blank, conclude
+from jast._src.core.typing import Reward
 from jast._src.runtime._jax import is_traced
-from jast._src.search.tree.best_episode import feed_level, follows, no_lead, take_fed
-from jast._src.search.tree.head_guidance import rolled
+from jast._src.search.tree.best_episode import Lead, feed_level, follows, no_lead, take_fed
+from jast._src.search.tree.head_guidance import Guide, rolled
 from jast._src.search.tree.packing import pack, unpack
 from jast._src.search.tree.pages import PAGE, ROW
 from jast._src.util.pytrees import select
@@ -74,11 +75,11 @@ class Problem(NamedTuple):
     """What a tree search is about: pytrees, each shared by all trees or with a leading axis [B]."""
 
     sim: Simulator
-    reward: Any
+    reward: Reward
     choice: Any
     """`search.tree.settings.Choice`."""
     settings: Settings
-    guide: Any = ()
+    guide: Guide | tuple[()] = ()
     """`search.tree.head_guidance.Guide`, or ``()`` for a search without heads."""
 
     @property
@@ -157,7 +158,7 @@ class Tree(NamedTuple):
     """[S, B] float: reward of the episode of each simulation."""
     outcome: jax.Array
     """[S, B] uint8: `outcome_of` each simulation."""
-    lead: Any
+    lead: Lead | tuple[()]
     """`Lead`, the best episode of each tree, or ``()`` where the search makes no use of it."""
     trials: jax.Array | tuple[()]
     """[S, 2, B] float: miss distance and true log p of the episode of each simulation; ``()`` where

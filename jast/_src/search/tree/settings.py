@@ -12,6 +12,7 @@ import jax.numpy as jnp
 
 from jast import distributions as D
 from jast._src.core.counter_prng import coin
+from jast._src.core.typing import Actions
 from jast._src.distributions.flat_rows import unflat
 from jast._src.runtime._jax import is_traced
 from jast._src.search.tree.layout import Problem, Settings, widths
@@ -93,8 +94,8 @@ class Choice:
     Algorithm 10); else it has Q = 0 (MCFS-AP eq. 3).
     """
 
-    actions: Any
-    focus: Any
+    actions: Actions
+    focus: jax.Array
     spread: bool = field(default=True, metadata=dict(static=True))
     focused: bool = field(default=True, metadata=dict(static=True))
     follow: bool = field(default=False, metadata=dict(static=True))

@@ -41,7 +41,7 @@ class Driving(NamedTuple):
     """`Cars` or `Transmission`"""
     samples: Any
     """[k, ...]: during the last step, the last of them now"""
-    step: Any
+    step: Array
     """int32"""
 
 

@@ -2,9 +2,12 @@
 told to do.
 """
 
-from typing import Any, NamedTuple
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
+
+from jast._src.core.typing import Array
 
 __all__ = ["SCENARIOS", "Scenario"]
 
@@ -14,14 +17,14 @@ class Scenario(NamedTuple):
     horizon.
     """
 
-    adversary: Any
+    adversary: Array | Sequence[float]
     """Its start: north (m), east (m), heading (radians, from north towards east); it moves ahead at
     the speed of the first row of the route.
     """
-    route: Any
+    route: Array
     """[steps, 3]: the surge, sway (m/s) and yaw rate (rad/s) that it is told at each search step.
     """
-    ferry: Any = (10.0, 0.0, 0.0)
+    ferry: Array | Sequence[float] = (10.0, 0.0, 0.0)
     """The ferry's start, at rest; its path goes from (0, 0) to (100, 0)."""
 
 
