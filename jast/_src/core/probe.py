@@ -22,7 +22,7 @@ from jast._src.core.simulator import Simulator, first_state, next_state
 from jast._src.core.typing import Array, ArrayTree
 from jast._src.runtime._jax import quick
 from jast._src.runtime.host_errors import runs_on_host
-from jast._src.util.pytrees import index_tree, select
+from jast._src.util.pytrees import index_tree, select, select_rows
 
 __all__ = ["Probe", "Resolution", "probe"]
 
@@ -186,7 +186,7 @@ def _probe(sim: Simulator) -> Probe:
     def body(now):
         t = now.t + 1
         after, x, improbable = jax.vmap(step, (0, 0, None, 0))(own, path, now.t, now.states)
-        states = jax.vmap(select)(now.done, now.states, after)
+        states = select_rows(now.done, now.states, after)
         ends, distance, nan = jax.vmap(look, axis_size=len(own))(states)
         flags = jax.tree.map(
             lambda noted, wrong: noted.at[t].set(wrong & ~now.done, mode="drop"),
@@ -197,7 +197,7 @@ def _probe(sim: Simulator) -> Probe:
         if company is not None:
             seen = of_starts((states, x, distance))
             later = jax.vmap(_follow, (0, 0, 0, 0, 0, None))(company, origins, *seen, t)
-            company = jax.vmap(select)(over(now.done), company, later)
+            company = select_rows(over(now.done), company, later)
         first_x = select(now.t == 0, x, now.x)
         return _Now(t, states, now.done | ends, flags=flags, x=first_x, company=company)
 

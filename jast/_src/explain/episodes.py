@@ -20,7 +20,7 @@ from jast._src.core.simulator import Simulator
 from jast._src.normal_space.transform import side_by_side
 from jast._src.runtime._jax import jit
 from jast._src.search.refine.modes import Mode
-from jast._src.util.pytrees import as_partial, index_tree
+from jast._src.util.pytrees import as_partial, index_tree, select_rows
 
 __all__ = [
     "FullEpisodes",
@@ -113,9 +113,7 @@ def named_kinds(function: str, labels: Any, n: int) -> tuple[tuple[str, ...], np
     return tuple(names.tolist()), at
 
 
-def play_to_horizon(
-    sim: Simulator, e: Episode, key: jax.Array, states: bool = True
-) -> FullEpisodes:
+def play_to_horizon(sim: Simulator, e: Episode, key: jax.Array, states: bool) -> FullEpisodes:
     """The episodes [n] of `gather_episodes`, whose disturbances go on.
 
     A failing episode is over sooner than others; what would have come is drawn from the model at
@@ -141,10 +139,7 @@ def _played_on(sim: Simulator, key: Any, at: Any, x0: Any, x: Any, length: Any) 
         keys = jax.random.split(jax.random.fold_in(key, at), sim.horizon)
         more = jax.vmap(lambda k: D.sample(last, k))(keys)
         live = jnp.arange(sim.horizon, dtype=jnp.int32) < length
-        merged = jax.tree.map(
-            lambda a, b: jnp.where(live.reshape(-1, *(1,) * (a.ndim - 1)), a, b), x, more
-        )
-        return merged, jax.tree.map(_plain, e.states)
+        return select_rows(live, x, more), jax.tree.map(_plain, e.states)
 
     return jax.vmap(one)(at, x0, x, length)
 

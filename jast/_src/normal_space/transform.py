@@ -33,7 +33,7 @@ from jast._src.normal_space.sequences import latent_policy
 from jast._src.runtime._jax import jit, quick
 from jast._src.runtime.host_errors import runs_on_host
 from jast._src.util.blocked_matmul import product, rows_of
-from jast._src.util.pytrees import count_numbers, index_tree, map_in_lanes, with_rows_of
+from jast._src.util.pytrees import count_numbers, index_tree, map_in_lanes, with_rows_of, zero_where
 
 __all__ = [
     "Latent",
@@ -395,7 +395,7 @@ def latents(sim, recorded, of_start):
         states = index_tree(states, np.s_[:-1])
         z = jax.vmap(lambda s, x: D.to_normal(sim.disturbance(s), x))(states, x)
         live = jnp.arange(sim.horizon, dtype=jnp.int32) < length
-        z = jax.tree.map(lambda a: jnp.where(live.reshape(-1, *(1,) * (a.ndim - 1)), a, 0), z)
+        z = jax.vmap(zero_where)(~live, z)
         return D.to_normal(sim.start(), x0) if of_start else (), z
 
     return jax.vmap(one)(*recorded)

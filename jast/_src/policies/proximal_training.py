@@ -28,7 +28,7 @@ from jast._src.policies.actor import (
     network_inputs,
     parameter_shapes,
 )
-from jast._src.util.pytrees import index_tree
+from jast._src.util.pytrees import index_tree, zero_where
 
 __all__ = ["Rates", "init_learner", "start_value", "train"]
 
@@ -199,12 +199,10 @@ def train(
             *keys, sim, config, networks[0], training, True
         )
 
-        def clean(a):
-            """What is not valid may hold numbers that are not finite."""
-            return jnp.where(valid.reshape(-1, *(1,) * (a.ndim - 1)), a, jnp.zeros_like(a))
-
+        # what is not valid may hold numbers that are not finite
+        rows = jax.vmap(zero_where)(~valid, rows)
         training = training._replace(lanes=lanes, step=training.step + 1)
-        return training, (jax.tree.map(clean, rows), valid, totals)
+        return training, (rows, valid, totals)
 
     def iterate(training):
         for_update = jax.random.fold_in(jax.random.fold_in(key, 1), training.step)

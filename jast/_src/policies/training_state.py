@@ -17,7 +17,7 @@ from jast._src.heads.heads import Moments
 from jast._src.policies.actor import Normalisation, latent_mixture, network_inputs, sample_latents
 from jast._src.policies.lanes import Lane, Transitions, begin_lane, lane_at, step_lane
 from jast._src.policies.start_fit import Tilt, fit_tilt
-from jast._src.util.pytrees import count_numbers, select
+from jast._src.util.pytrees import count_numbers, select_rows
 
 __all__ = [
     "Config",
@@ -218,7 +218,7 @@ def step_lanes(
         nearest=total(ended, moved.nearest),
         squares=total(ended, moved.nearest**2),
     )
-    return jax.vmap(select)(moved.over, again, moved), new, valid, totals
+    return select_rows(moved.over, again, moved), new, valid, totals
 
 
 @functools.partial(jax.jit, static_argnames=("config", "apply"))

@@ -19,7 +19,7 @@ from jast._src.core.transition import advance, begin, conclude
 from jast._src.runtime.host_errors import runs_on_host
 from jast._src.search.result import Trials
 from jast._src.search.tree.packing import pack
-from jast._src.util.pytrees import index_tree, select, zero_where
+from jast._src.util.pytrees import index_tree, select_rows, zero_where
 
 __all__ = [
     "EMPTY_HASH",
@@ -32,7 +32,6 @@ __all__ = [
     "in_blocks",
     "play_drawn",
     "play_lanes",
-    "select_lanes",
     "take_rows",
 ]
 
@@ -152,8 +151,8 @@ def play_lanes(sim, reward, keys, draw_start, draw, live, rows=((), ()), record=
         t, length, tag, xs, before = carry
         on = ~before.done
         x, after, folded = move(*at(t + start, rows[1], t), before, tag, t + 1 >= sim.horizon)
-        state = select_lanes(on, after.state, before.state) if sim.episodic else after.state
-        after = select_lanes(on, after._replace(state=()), before._replace(state=()))
+        state = select_rows(on, after.state, before.state) if sim.episodic else after.state
+        after = select_rows(on, after._replace(state=()), before._replace(state=()))
         if record:
             x = jax.vmap(zero_where)(~on, x)
             xs = jax.tree.map(lambda a, b: a.at[t].set(b), xs, x)
@@ -207,11 +206,6 @@ def in_blocks(block, lanes, begin, end, carry):
 
     _, carry, tally = lax.while_loop(lambda c: left(c[0]), body, (begin, carry, Tally.none()))
     return carry, tally
-
-
-def select_lanes(pred, a, b):
-    """Leaves [lanes, ...] of ``a`` where ``pred`` [lanes], else of ``b``."""
-    return jax.vmap(select)(pred, a, b)
 
 
 @partial(jax.jit, static_argnums=1)

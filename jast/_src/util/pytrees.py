@@ -21,6 +21,7 @@ __all__ = [
     "map_in_lanes",
     "pad_rows",
     "select",
+    "select_rows",
     "shapes_text",
     "with_strong_types",
     "traceable",
@@ -88,6 +89,11 @@ class _WithFunctions:
 def select(pred: Any, a: Any, b: Any) -> Any:
     """``a`` where the scalar ``pred`` holds, else ``b``."""
     return jax.tree.map(lambda x, y: jnp.where(pred, x, y), a, b)
+
+
+def select_rows(pred: Any, a: Any, b: Any) -> Any:
+    """Rows [n, ...] of ``a`` where ``pred`` [n] holds, else of ``b``."""
+    return jax.vmap(select)(pred, a, b)
 
 
 def index_tree(tree: Any, where: Any) -> Any:

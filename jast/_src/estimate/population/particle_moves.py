@@ -22,7 +22,7 @@ from jax import lax
 from jast._src.core.simulator import Simulator
 from jast._src.normal_space.transform import dimension, normal_numbers, outcome_by_level
 from jast._src.runtime.device import block_size
-from jast._src.util.pytrees import index_tree
+from jast._src.util.pytrees import index_tree, select_rows
 
 __all__ = [
     "AFTER",
@@ -208,9 +208,7 @@ def _move_on_device(sim, particles, key, rows, size, wide, live, moves, kinds, l
             reached=reached,
         )
         taken = score <= level
-        new = jax.tree.map(
-            lambda a, b: jnp.where(taken.reshape(-1, *(1,) * (a.ndim - 1)), a, b), proposed, old
-        )
+        new = select_rows(taken, proposed, old)
         particles = jax.tree.map(
             lambda a, b: lax.dynamic_update_slice_in_dim(a, b, i * lanes, 0), particles, new
         )

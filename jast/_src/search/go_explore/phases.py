@@ -22,8 +22,8 @@ from jast._src.search.go_explore.continued_runs import (
     played_runs,
     start_point,
 )
-from jast._src.search.lanes import Tally, in_blocks, select_lanes
-from jast._src.util.pytrees import index_tree, select
+from jast._src.search.lanes import Tally, in_blocks
+from jast._src.util.pytrees import index_tree, select, select_rows
 
 __all__ = ["Plan", "Traces", "improve_backward", "explore"]
 
@@ -71,7 +71,7 @@ def explore(key, sim, reward, cell, plan, cells, best, begin, end):
         x0 = jax.vmap(lambda k, own: draw_start(k, own, sim.start()))(keys, noise)
         first = jax.vmap(partial(start_point, sim, reward), axis_size=plan.lanes)(x0)
         kept = index_tree(cells, slot)
-        points, x0 = select_lanes(anew, (first, x0), (kept.points, kept.x0))
+        points, x0 = select_rows(anew, (first, x0), (kept.points, kept.x0))
         until = jnp.where(live, points.t + length, 0)
         ends, new, xs, points_on = continue_runs(
             sim, reward, keys, points, until, draw, noise, length, keep=True
@@ -171,7 +171,7 @@ def _bettered(traces, played, live):
     row = jnp.argmax(value, axis=0) * p + jnp.arange(p)
     new = Traces(e.x0, e.disturbances, e.length, e.reward)
     new = index_tree(new, row)
-    return select_lanes(jnp.max(value, axis=0) > traces.reward, new, traces)
+    return select_rows(jnp.max(value, axis=0) > traces.reward, new, traces)
 
 
 def _tally(played, new, live, number):

@@ -8,12 +8,12 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from jast._src.search.lanes import select_lanes
 from jast._src.search.tree.best_episode import fed_source, follows
 from jast._src.search.tree.layout import choose, nodes_of
 from jast._src.search.tree.pages import PAGE, ROW, add_turn, children_of
 from jast._src.search.tree.simulate import child_state, replay_to
 from jast._src.util import display
+from jast._src.util.pytrees import select_rows
 
 __all__ = ["Roots", "prune", "recounted"]
 
@@ -94,7 +94,7 @@ def prune(problem, tree, children, memoize="node", axes=None):
         after = jax.vmap(child_state, in_axes=(axes, *[0] * 7))(
             problem, tree.key, root, slot, level, state, *of
         )
-        tree = tree._replace(base=select_lanes(move, after, state))
+        tree = tree._replace(base=select_rows(move, after, state))
     return tree, roots
 
 

@@ -5,14 +5,13 @@ import jax.numpy as jnp
 from jax import lax
 
 from jast._src.core.transition import Progress, blank, conclude
-from jast._src.search.lanes import select_lanes
 from jast._src.search.tree import layout
 from jast._src.search.tree.best_episode import fed_of, fed_source, feed_level, follows, update_lead
 from jast._src.search.tree.child_values import evaluate_children
 from jast._src.search.tree.packing import pack
 from jast._src.search.tree.pages import back_up, fills
 from jast._src.search.tree.select import walk_down
-from jast._src.util.pytrees import index_tree, select
+from jast._src.util.pytrees import index_tree, select, select_rows
 
 __all__ = ["child_state", "grow", "replay_to"]
 
@@ -88,7 +87,7 @@ def _simulation(problem, axes, tree, i, memoize):
         if problem.choice.feed:
             here = live & (level == middle)
             taken = jnp.where(here[:, None], jax.vmap(pack)((here, x)), taken)
-        state = select_lanes(live, after.state, at.state) if episodic else after.state
+        state = select_rows(live, after.state, at.state) if episodic else after.state
         return level + 1, steps + _one(live), without_log_p(kept._replace(state=state)), taken
 
     # a random start is a level, but no step
@@ -164,7 +163,7 @@ def replay_to(problem, axes, tree, trail, depth, memoize, lane=None, live=None):
         live = running & (level < depth)
         taken = node.source, fed_source(tree, node.source, lane)
         after = move(problem, key, node.parent, node.slot, level, state, *taken)
-        return level + _one(live), select_lanes(live, after, state)
+        return level + _one(live), select_rows(live, after, state)
 
     _, state = lax.while_loop(lambda c: jnp.any(running & (c[0] < depth)), body, (first, base))
     chosen = problem.levels - problem.sim.horizon  # a random start is a level, but no step
