@@ -67,7 +67,6 @@ class Plan(NamedTuple):
     """Where a mixture's fit begins: "elites" with the searches' first covariance, or "searches", as
     these ended
     """
-    em_iterations: int = 10
 
 
 class Settings(NamedTuple):
@@ -344,12 +343,7 @@ def _refit_mixture(plan, settings, proposal, elites, sub, spread, everything):
     else:
         covariances = jnp.broadcast_to(spread[None], (k, *spread.shape))
         first = Mixture(weights, elites.x[:k], covariances)
-    new = mixture.em(
-        first,
-        *everything,
-        iterations=plan.em_iterations,
-        regularisation=settings.regularisation,
-    )
+    new = mixture.em(first, *everything, regularisation=settings.regularisation)
     return jax.tree.map(lambda a, b: jnp.where(jnp.any(there > 0), a, b), new, proposal)
 
 

@@ -155,7 +155,7 @@ def events(
     draws, level = draws_and_level(name, estimate, level)
     one_of(name, "of", of, EVENT_ARGUMENTS)
     functions = _check_functions(name, named)
-    happened = _evaluate_events(name, sim, estimate, draws, functions, of, proposal)
+    happened = _evaluate_events(name, sim, draws, functions, of, proposal)
     return {k: _event(estimate, draws, v, level) for k, v in happened.items()}
 
 
@@ -194,10 +194,10 @@ def given_start(
     check_random_key(name, key)
     kept, level = draws_and_level(name, estimate, level)
     functions = _check_functions(name, named)
-    happened = _evaluate_events(name, sim, estimate, kept, functions, "start", proposal)
+    happened = _evaluate_events(name, sim, kept, functions, "start", proposal)
     n, count = whole_number(name, "draws", draws), dict.fromkeys(functions, 0)
     for i in range(-(-n // BLOCK_STARTS)):
-        seen = _evaluate_starts(jax.random.fold_in(key, i), sim, functions, BLOCK_STARTS)
+        seen = _evaluate_starts(jax.random.fold_in(key, i), sim, functions)
         for k, v in seen.items():
             count[k] += int(np.asarray(v)[: n - i * BLOCK_STARTS].sum())
     return {
@@ -270,7 +270,7 @@ def _check_functions(name: str, named: Any) -> dict[str, Callable]:
     return {k: as_partial(f) for k, f in named.items()}
 
 
-def _evaluate_events(name, sim, estimate, draws, functions, of, proposal):
+def _evaluate_events(name, sim, draws, functions, of, proposal):
     """Name -> [m] bool, in which of the failing draws each event happened."""
     rows, length = draws.row[draws.failure], draws.length[draws.failure]
     if not len(rows):
@@ -343,10 +343,12 @@ def _disturbances(sim, proposal, made):
     return D.mode(player.start()), lambda s, t: D.mode(player.disturbance(s, t))
 
 
-@partial(jax.jit, static_argnums=3)
-def _evaluate_starts(key, sim, functions, n):
+@jax.jit
+def _evaluate_starts(key, sim, functions):
+    """Name -> what it returns for each of `BLOCK_STARTS` first states."""
+
     def one(key):
         first = first_state(sim, D.sample(sim.start(), key))
         return {k: jnp.asarray(f(first)) for k, f in functions.items()}
 
-    return jax.vmap(one)(jax.random.split(key, n))
+    return jax.vmap(one)(jax.random.split(key, BLOCK_STARTS))

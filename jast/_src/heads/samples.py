@@ -59,7 +59,7 @@ def samples_of_roots(sim, actions, roots, bins, good, first=0):
     return policy, value
 
 
-def samples_of_edges(edges, target="own"):
+def samples_of_edges(edges, target):
     """`Samples` for a value head from `search.tree.edges.Edges`: Q(s, a), or the Q of the edge
     that leads to s, as published (``target="parent"``).
     """

@@ -112,11 +112,11 @@ def _one(found: Any, tree: int, value: np.ndarray, target: int) -> Nodes:
     )
 
 
-def write_tree(caller: str, path: Any, result: Any, tree: int | None = None) -> None:
+def write_tree(path: Any, result: Any, tree: int | None) -> None:
     """Write the page of a tree of ``result`` to the one file ``path``; arguments and errors as for
     `nodes_of`.
     """
-    nodes = nodes_of(caller, result, tree)
+    nodes = nodes_of("plot.tree_page", result, tree)
     trees = jax.tree.map(lambda a: np.asarray(a)[:, nodes.tree], result.trees)
     width = sum(min(ENTRIES, a[0].size) for a in jax.tree.leaves((trees.x, trees.start)) if len(a))
     shown = _shown(nodes, BYTES // (NODE + NUMBER * width))

@@ -29,6 +29,7 @@ from jast._src.util.checks import number, whole_number
 __all__ = ["colav", "colav_animation", "colav_story", "draw_moments", "zone_outline"]
 
 BELIEF, ZONE, DASHED = style.GREEN, style.ORANGE, (0, (3, 1.2))
+OUTLINE = 200  # points of a zone's edge; a convention
 SHADES = ((0.30, "-"), (0.16, "--"), (0.07, ":"))  # of `ZONES`: opacity, edge
 
 
@@ -306,11 +307,11 @@ def _at(rows, t):
     return np.array([np.interp(t, np.arange(len(rows)), column) for column in rows.T])
 
 
-def zone_outline(zone, n, e, course, points=200):
-    """The edge of a zone around an obstacle at (n, e) on a course (radians): [points, 2] of (e,
-    n).
+def zone_outline(zone, n, e, course):
+    """The edge of a zone around an obstacle at (n, e) on a course (radians): [OUTLINE, 2] of
+    (e, n).
     """
-    angle = np.linspace(0, 2 * np.pi, points)
+    angle = np.linspace(0, 2 * np.pi, OUTLINE)
     ahead = np.cos(angle) * np.where(np.cos(angle) > 0, zone.forward, zone.aft)
     right = np.sin(angle) * np.where(np.sin(angle) > 0, zone.starboard, zone.port)
     return placed(ahead, right, e, n, course)

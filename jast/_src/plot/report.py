@@ -245,7 +245,7 @@ def _draw_traces(page: _Page, owned: tuple, k: int, units: Any, legend: bool) ->
     kinds = [(np.arange(len(rows)), *style.look(k), f"mode {k + 1}")]
     draw_traces(axes, names, kinds, part, behind, quiet, units)
     for ax in axes:
-        _shrink_labels(ax, "step")
+        _shrink_labels(ax)
     if legend:
         look = dict(fontsize=7, ncols=4, loc="lower right", handlelength=1.6, columnspacing=1.2)
         handles, words = axes[0].get_legend_handles_labels()
@@ -292,11 +292,11 @@ def _draw_disturbances(ax: Any, sim: Any, failure: Any) -> None:
     if few and len(named) > 1:
         ax.legend(fontsize=6.5, loc="best", handlelength=1.2, borderpad=0.1, labelspacing=0.2)
     ax.set_ylabel("disturbance" + " (sd)" * bool(normal))
-    _shrink_labels(ax, "step")
+    _shrink_labels(ax)
 
 
-def _shrink_labels(ax: Any, label: str) -> None:
-    ax.set_xlabel(label, fontsize=8, labelpad=1)
+def _shrink_labels(ax: Any) -> None:
+    ax.set_xlabel("step", fontsize=8, labelpad=1)
     ax.yaxis.label.set_size(8)
     ax.yaxis.labelpad = 2
     ax.tick_params(labelsize=7, pad=1, length=0)

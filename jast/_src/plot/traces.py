@@ -91,7 +91,7 @@ def draw_traces(
     own: Series,
     behind: Series | None,
     quiet: Series | None,
-    units: dict | None = None,
+    units: dict | None,
 ) -> None:
     """The panels of `traces`: the ``names`` on ``axes``, without labels of steps and a legend;
     ``kinds``: as of `by_mode`, rows of ``own``.

@@ -88,4 +88,4 @@ def tree_page(result: Any, path: PathLike, *, tree: int | None = None) -> None:
         ...     os.path.exists(path)
         True
     """
-    write_tree("plot.tree_page", path, result, tree)
+    write_tree(path, result, tree)

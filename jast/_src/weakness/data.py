@@ -113,7 +113,7 @@ def are_indices(at, n):
     return not at.size or bool(at.dtype.kind in "iu" and at.min() >= 0 and at.max() < n)
 
 
-def data_of_result(function, result, inputs, labels, classes=None):
+def data_of_result(function, result, inputs, labels, classes):
     """The `Data` of a ``result``; ValueError for other inputs or labels than its own."""
     instance(function, "result", result, Result, "a Result")
     if classes is None and np.size(labels) and np.asarray(labels).dtype.kind in "iub":

@@ -24,6 +24,7 @@ __all__ = ["Cells", "choose_cells", "empty_cells", "features", "merge_cells"]
 
 PHASES = 16  # stretches of the horizon that cells tell apart
 HALVES = 12  # halvings of the rank of the miss distance: the nearest of 4096 states are told apart
+NEAREST = 0.5  # share of the choices that are of the states nearest to failure first
 SIDES = 3  # cells to each side of the mean of a projection, half a standard deviation each
 
 
@@ -65,16 +66,16 @@ def features(sim: Simulator, state: Any) -> jax.Array:
     return jnp.clip(jnp.nan_to_num(row, nan=0.0), -1e6, 1e6)
 
 
-def choose_cells(cells: Cells, coin: jax.Array, u: jax.Array, nearest: Any) -> jax.Array:
+def choose_cells(cells: Cells, coin: jax.Array, u: jax.Array) -> jax.Array:
     """The slot [N] of each lane by uniform numbers ``coin`` and ``u`` [N]: with probability
-    ``nearest`` those that are nearest to failure first, else those least gone on from.
+    `NEAREST` those that are nearest to failure first, else those least gone on from.
     """
     live = cells.live.astype(u.dtype)
     near = jnp.where(cells.live & jnp.isfinite(cells.near), cells.near, jnp.inf)
     rank = jnp.searchsorted(jnp.sort(near), near, side="right").astype(u.dtype)
     seen = 1 / (1 + cells.seen.astype(u.dtype))
     near_first = _drawn(live * jnp.sqrt(seen) / jnp.maximum(rank, 1), u)
-    pick = jnp.where(coin < nearest, near_first, _drawn(live * seen, u))
+    pick = jnp.where(coin < NEAREST, near_first, _drawn(live * seen, u))
     return jnp.minimum(pick, live.shape[0] - 1).astype(jnp.int32)
 
 

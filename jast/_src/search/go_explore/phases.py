@@ -29,7 +29,6 @@ __all__ = ["Plan", "Traces", "improve_backward", "explore"]
 
 POINTS = 8  # states that are kept of a run at most
 FROM_START = 0.1  # share of the runs that are from the start
-NEAREST = 0.5  # share of the others that are from the states nearest to failure
 WIDTHS = 1.0, 1.0, 1.5, 2.0, 3.0, 4.0  # of the noise of a run: a third draw from the model
 PERSISTING = 0.0, 0.0, 0.5, 0.9  # shares of the noise of a run that are the same at every step
 COINS = np.uint32(3 << 30)  # address of a run's choices, apart from those of its steps
@@ -66,7 +65,7 @@ def explore(key, sim, reward, cell, plan, cells, best, begin, end):
         cells, best = carry
         keys, coins = _keys_and_coins(sim, key, number)
         noise = _noise(coins)
-        slot = choose_cells(cells, coins[:, 0], coins[:, 1], NEAREST)
+        slot = choose_cells(cells, coins[:, 0], coins[:, 1])
         anew = (coins[:, 2] < FROM_START) | ~jnp.any(cells.live)
         x0 = jax.vmap(lambda k, own: draw_start(k, own, sim.start()))(keys, noise)
         first = jax.vmap(partial(start_point, sim, reward), axis_size=plan.lanes)(x0)
