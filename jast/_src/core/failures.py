@@ -25,7 +25,7 @@ from jast._src.io.data_frames import dataframe
 from jast._src.io.export import by_step, from_json, to_csv, to_numpy
 from jast._src.util import display
 from jast._src.util.checks import instance, wrong
-from jast._src.util.pytrees import index_tree
+from jast._src.util.pytrees import index_tree, join_rows
 
 __all__ = [
     "Failures",
@@ -298,7 +298,7 @@ def merge(a: Failures, b: Failures, top: int = 64) -> Failures:
             "merge: both archives must be of one simulator, received episodes of shapes"
             f" {shapes[0]} and {shapes[1]}"
         )
-    arrays = jax.tree.map(lambda u, v: np.concatenate([u, v]), a.rows(), b.rows())
+    arrays = join_rows(a.rows(), b.rows())
     return _best("merge", Failures(*arrays, seen=0, dropped=0), top).replace(
         seen=a.seen + b.seen, dropped=a.dropped + b.dropped
     )

@@ -31,6 +31,7 @@ from jast._src.runtime.progress_bar import Watch
 from jast._src.util.checks import check_random_key, whole_number
 from jast._src.util.display import call_settings
 from jast._src.util.intervals import checked_level
+from jast._src.util.pytrees import join_rows
 
 __all__ = ["episode_keys", "lanes_of_points", "monte_carlo", "plain_traces", "simulate_points"]
 
@@ -120,7 +121,7 @@ def simulate_points(shared: tuple[Any, ...], i: int, context: Any) -> Traces:
     else:
         parts = enumerate(plain_parts(key, i, n, sim))
         found = [evaluate_on_device(sim, z, min(m, n - j * m)) for j, z in parts]
-        o = jax.tree.map(lambda *a: np.concatenate(a), *found)
+        o = join_rows(*found)
     return plain_traces(o.failure, o.invalid, o.length, o.distance)
 
 

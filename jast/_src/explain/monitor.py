@@ -16,6 +16,7 @@ from jast._src.explain.held_out import hold_out, share_of, sklearn_module
 from jast._src.explain.training_cases import given_cases, simulate_cases
 from jast._src.util import checks, display
 from jast._src.util.intervals import checked_level
+from jast._src.util.pytrees import join_rows
 from jast._src.weakness.measures import Roc, roc
 
 __all__ = ["Monitor", "monitor"]
@@ -266,7 +267,7 @@ def _episodes(name, key, sim, failures, others, episodes, budget):
             f"{name}: others: expected at least {EPISODES} of {episodes} ordinary episodes that do"
             f" not fail, received {n}"
         )
-    e = jax.tree.map(lambda a, b: np.concatenate([a, b]), cases.episodes, plain)
+    e = join_rows(cases.episodes, plain)
     kind = np.concatenate([np.where(cases.kind > 0, FAILING, NEAR), np.full(n, ORDINARY)])
     group = np.concatenate([cases.group, cases.group.max() + 1 + np.arange(n)])
     return e, kind, group, cases.evaluations + episodes

@@ -12,7 +12,7 @@ from jast._src.explain.episodes import distinct_rows, gather_episodes, named_kin
 from jast._src.explain.held_out import DISTINCT
 from jast._src.explain.variants import EACH, draw_variants, find_seeds
 from jast._src.runtime.host_errors import runs_on_host
-from jast._src.util.pytrees import index_tree
+from jast._src.util.pytrees import index_tree, join_rows
 
 __all__ = ["given_cases", "simulate_cases"]
 
@@ -112,7 +112,7 @@ def given_cases(
                 f"{function}: {argument} must hold at least {least} distinct episodes of each"
                 f" kind, received {few}; leave others out and {function} simulates more"
             )
-    e = jax.tree.map(lambda a, b: np.concatenate([a, b]), *parts)
+    e = join_rows(*parts)
     owner = np.concatenate(kind)
     return Cases(
         episodes=e, kind=owner, group=np.arange(len(owner)), names=(OTHERS, *names), evaluations=0

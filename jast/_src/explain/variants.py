@@ -18,7 +18,7 @@ from jast._src.normal_space.episode_point import turned_in_time
 from jast._src.normal_space.evaluate_points import PointEvaluator
 from jast._src.normal_space.pcn import proposed
 from jast._src.search.refine.modes import Modes, owners
-from jast._src.util.pytrees import index_tree
+from jast._src.util.pytrees import index_tree, join_rows
 
 __all__ = ["EACH", "draw_variants", "find_seeds"]
 
@@ -190,7 +190,7 @@ def draw_variants(
     if crowded:
         # no seed can be held out: its variants are
         group = np.arange(len(group))
-    e = jax.tree.map(lambda a, b: np.concatenate([a[fails], b[calm_rows]]), bad, calm)
+    e = join_rows(index_tree(bad, fails), index_tree(calm, calm_rows))
     kind = np.concatenate([1 + label, np.zeros(len(calm_rows), int)])
     return e, kind, group, evaluate.spent + len(z) + len(missed)
 

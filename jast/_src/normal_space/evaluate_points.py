@@ -16,6 +16,7 @@ from jast._src.runtime.checkpoints import answer_once
 from jast._src.runtime.device import BLOCK, block_size, on_cpu
 from jast._src.runtime.host_errors import runs_on_host
 from jast._src.runtime.progress_bar import Watch
+from jast._src.util.pytrees import join_rows
 
 __all__ = [
     "PointEvaluator",
@@ -110,7 +111,7 @@ def _by_program(play, sim, z, part=lambda found: found):
         points = z[i : i + lanes]
         ask = partial(_padded, play, sim, lanes, part)
         out.append(answer_once(ask, points, rows=len(points)))
-    return out[0] if len(out) == 1 else jax.tree.map(lambda *a: np.concatenate(a), *out)
+    return out[0] if len(out) == 1 else join_rows(*out)
 
 
 @partial(jit, static_argnums=2)

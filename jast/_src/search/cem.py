@@ -341,7 +341,7 @@ def _merge(elites, new):
 
 
 @partial(jax.jit, static_argnums=(1, 2, 3))
-def _first_state(sim, plan, trees, k, width, around=()):
+def _first_state(sim, plan, trees, k, width, around):
     """No elites and the first proposals, of every tree."""
 
     def first(kind, like, steps, mean):

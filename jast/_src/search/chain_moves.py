@@ -15,7 +15,7 @@ from jast._src.normal_space.pcn import proposed
 from jast._src.normal_space.transform import dimension, normal_numbers, split_point, used_numbers
 from jast._src.runtime._jax import jit
 from jast._src.search.lanes import Played, Tally, in_blocks, play_lanes
-from jast._src.util.pytrees import index_tree
+from jast._src.util.pytrees import index_tree, select_rows
 
 __all__ = ["Chains", "Points", "draw_wider", "move_chains", "no_points"]
 
@@ -101,7 +101,7 @@ def move_chains(key, sim, reward, best, chains, widths, begin, end):
         share = jnp.mean(take, axis=1, dtype=real)
         scale = chains.scale * jnp.exp(ADAPTATION * (share - ACCEPTANCE))
         chains = chains._replace(
-            points=jax.tree.map(partial(jax.vmap(jax.vmap(jnp.where)), take), new, old),
+            points=jax.vmap(select_rows)(take, new, old),
             scale=jnp.clip(scale, MIN_SCALE, 1),
             accepted=MEMORY * chains.accepted + (1 - MEMORY) * share,
         )

@@ -35,6 +35,7 @@ from jast._src.search.lanes import NEVER, Tally
 from jast._src.search.refine.final import refine_failures
 from jast._src.search.result import History, SearchResult, Trials
 from jast._src.util import checks
+from jast._src.util.pytrees import join_rows
 
 __all__ = [
     "Log",
@@ -103,7 +104,7 @@ class Noted(NamedTuple):
     def log(self, interrupted: str | None = None) -> Log:
         """The `Log` of them."""
         *moments, trials = zip(*self.moments, strict=True)
-        trials = None if trials[0] is None else jax.tree.map(lambda *a: np.concatenate(a), *trials)
+        trials = None if trials[0] is None else join_rows(*trials)
         return Log(self.tally, History(*(np.array(v) for v in moments)), interrupted, trials)
 
 

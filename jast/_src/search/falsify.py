@@ -27,7 +27,7 @@ from jast._src.search.driver import Log, finish, require_counts, require_host, r
 from jast._src.search.lanes import NEVER, Tally
 from jast._src.search.result import SearchResult
 from jast._src.util.display import call_settings
-from jast._src.util.pytrees import count_numbers, index_tree, map_in_lanes
+from jast._src.util.pytrees import count_numbers, index_tree, join_rows, map_in_lanes
 
 __all__ = ["falsify"]
 
@@ -159,7 +159,7 @@ class _Search:
         o = index_tree(o, np.s_[:n])
         score = np.where(o.invalid, np.inf, np.where(o.failure, -1, o.distance))
         new = Pool(score, rows, first, o.length)
-        pool = jax.tree.map(lambda *a: np.concatenate(a), pool, new)
+        pool = join_rows(pool, new)
         best = np.argsort(pool.score, kind="stable")[:POOL]
         pool = index_tree(pool, best)
         failing = np.flatnonzero(o.failure)

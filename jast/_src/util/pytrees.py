@@ -18,6 +18,7 @@ __all__ = [
     "conform",
     "fields_of",
     "index_tree",
+    "join_rows",
     "map_in_lanes",
     "pad_rows",
     "select",
@@ -101,6 +102,11 @@ def index_tree(tree: Any, where: Any) -> Any:
     return jax.tree.map(lambda a: a[where], tree)
 
 
+def join_rows(*trees: Any) -> Any:
+    """The rows of trees of arrays, those of the first tree first. On the host."""
+    return jax.tree.map(lambda *a: np.concatenate(a), *trees)
+
+
 def with_rows_of(like: jax.Array, tree: Any) -> Any:
     """``tree``, the carry that a loop starts with, of which every array depends on the numbers
     ``like``, for `jax.vmap` and for derivatives; the values are the same.
@@ -142,7 +148,7 @@ def map_in_lanes(size: int, function: Callable, *trees: Any) -> Any:
     found = [
         function(*jax.tree.map(lambda a, rows=rows: np.asarray(a)[rows], trees)) for rows in parts
     ]
-    return jax.tree.map(lambda *a: np.concatenate(a)[:n], *jax.device_get(found))
+    return index_tree(join_rows(*jax.device_get(found)), np.s_[:n])
 
 
 def fields_of(record: Any) -> dict[str, Any]:

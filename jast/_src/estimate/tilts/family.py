@@ -11,7 +11,6 @@ from collections.abc import Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
-import jax
 import numpy as np
 
 from jast._src.core.simulator import Simulator
@@ -41,7 +40,7 @@ from jast._src.estimate.tilts.tilts import (
     step_numbers,
 )
 from jast._src.normal_space.transform import normal_numbers
-from jast._src.util.pytrees import index_tree
+from jast._src.util.pytrees import index_tree, join_rows
 
 __all__ = ["Mixture", "Points", "TiltFamily", "at_level"]
 
@@ -178,7 +177,7 @@ class TiltFamily(NamedTuple):
 
     def refit(self, state: SearchState) -> dict[str, Mixture]:
         """The mixture that is fitted to the failures of all batches."""
-        points = _join(*(b.points for b in state.batches))
+        points = join_rows(*(b.points for b in state.batches))
         return {"refitted": self.fit(points, state.log_weight, self.groups(state.q, points))}
 
     def absorb(self, state: SearchState, found: Sequence[tuple[Points, float]]) -> SearchState:
@@ -186,7 +185,7 @@ class TiltFamily(NamedTuple):
         probability is a share, as great, times what it found; as many as there is room for.
         """
         found = found[: (COMPONENTS[-1] - len(state.q.tilts)) // 2]
-        points = _join(*(b.points for b in state.batches))
+        points = join_rows(*(b.points for b in state.batches))
         log_w = state.log_weight - np.logaddexp.reduce(state.log_weight)
         of = self.groups(state.q, points)
         for more, share in found:
@@ -194,7 +193,7 @@ class TiltFamily(NamedTuple):
             own = np.repeat([[0.0], [1.0]], [len(log_w), n], axis=0)
             of = np.concatenate([np.pad(of, ((0, n), (0, 0))), own], axis=1)
             log_w = np.concatenate([log_w, np.full(n, math.log(share / n))])
-            points = _join(points, more)
+            points = join_rows(points, more)
         return state._replace(q=self.fit(points, log_w, of)) if found else state
 
     def groups(self, q: Mixture, points: Points) -> np.ndarray:
@@ -245,8 +244,3 @@ def at_level(family: TiltFamily, q: Mixture, p: Play, level: float) -> Batch:
     rows = near[: family.settings.failures_kept]
     size = len(p.score) * len(rows) // len(near) if len(near) else len(p.score)
     return Batch(q, index_tree(p.points, rows), p.log_weight[rows], size)
-
-
-def _join(*points: Points) -> Points:
-    """All ``points``."""
-    return jax.tree.map(lambda *a: np.concatenate(a), *points)

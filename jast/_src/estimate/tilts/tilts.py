@@ -29,7 +29,7 @@ from jast._src.normal_space.transform import normal_numbers, outcomes_of
 from jast._src.runtime._jax import jit
 from jast._src.runtime.checkpoints import answer_once
 from jast._src.runtime.host_errors import runs_on_host
-from jast._src.util.pytrees import select
+from jast._src.util.pytrees import index_tree, join_rows, select
 
 __all__ = [
     "Block",
@@ -361,7 +361,7 @@ def _run_in_lanes(sim, n, run, given):
     for i in range(0, n, lanes):
         rows = np.minimum(np.arange(i, i + lanes), n - 1)
         out.append(answer_once(lambda rows, _: run(rows), rows, given))
-    return jax.tree.map(lambda *a: np.concatenate(a)[:n], *out)
+    return index_tree(join_rows(*out), np.s_[:n])
 
 
 @jit

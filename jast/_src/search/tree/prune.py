@@ -13,7 +13,7 @@ from jast._src.search.tree.layout import choose, nodes_of
 from jast._src.search.tree.pages import PAGE, ROW, add_turn, children_of
 from jast._src.search.tree.simulate import child_state, replay_to
 from jast._src.util import display
-from jast._src.util.pytrees import select_rows
+from jast._src.util.pytrees import index_tree, select_rows
 
 __all__ = ["Roots", "prune", "recounted"]
 
@@ -90,7 +90,7 @@ def prune(problem, tree, children, memoize="node", axes=None):
             lead=lead._replace(on=lead.on & keep, value=jnp.where(keep, lead.value, -jnp.inf))
         )
     if memoize == "root":
-        of = jax.tree.map(lambda a: jax.vmap(lambda row, j: row[j])(a, slot), (source, fed))
+        of = jax.vmap(index_tree)((source, fed), slot)
         after = jax.vmap(child_state, in_axes=(axes, *[0] * 7))(
             problem, tree.key, root, slot, level, state, *of
         )

@@ -13,7 +13,7 @@ from jast._src.search.lanes import NEVER, Tally
 from jast._src.search.result import History, SearchResult, Trials
 from jast._src.search.tree.layout import flags
 from jast._src.search.tree.run import Traced, TreeBatch
-from jast._src.util.pytrees import index_tree
+from jast._src.util.pytrees import index_tree, join_rows
 
 __all__ = ["result", "traced_result"]
 
@@ -46,13 +46,11 @@ def result(search: Any, batches: list[TreeBatch], settings: dict, training: Any)
         interrupted=None,
         trials=_trials(batches, value, failed, fresh),
     )
-    found, tree, simulation = jax.tree.map(
-        lambda *parts: np.concatenate(parts), *((b.found, b.tree, b.simulation) for b in batches)
-    )
-    nearest = _take(found, np.argmax(np.where(found.failure, -np.inf, found.reward)))
+    found, tree, simulation = join_rows(*((b.found, b.tree, b.simulation) for b in batches))
+    nearest = index_tree(found, np.argmax(np.where(found.failure, -np.inf, found.reward)))
     rows = _distinct(found, tree, simulation, search.top)
     where = dict(numbers=simulation[rows], trees=tree[rows])
-    done = finish(search, noted, nearest, _take(found, rows), settings=settings, **where)
+    done = finish(search, noted, nearest, index_tree(found, rows), settings=settings, **where)
     return done._replace(
         trees=_beside([b.branches for b in batches]),
         roots=_beside([b.roots for b in batches]),
@@ -72,9 +70,9 @@ def _beside(parts: list[Any]) -> Any:
 def _misses(batches: list[TreeBatch], top: int) -> Episode:
     """The ``top`` best episodes of trees that found no failure, one a tree, by falling reward."""
     own = [index_tree(h.found, np.s_[: h.log.shape[1]]) for h in batches]
-    best = jax.tree.map(lambda *parts: np.concatenate(parts), *own)
+    best = join_rows(*own)
     rows = np.flatnonzero(~best.failure & np.isfinite(best.reward))
-    return _take(best, rows[np.argsort(-best.reward[rows], kind="stable")][:top])
+    return index_tree(best, rows[np.argsort(-best.reward[rows], kind="stable")][:top])
 
 
 def _trials(batches: list[TreeBatch], value, failed, fresh) -> Trials | None:
@@ -94,7 +92,7 @@ def _distinct(found: Episode, tree, simulation, top: int) -> np.ndarray:
         if not found.failure[i] or (tree[i], simulation[i]) in seen:
             continue
         seen.add((tree[i], simulation[i]))
-        names.add(identity(_take(found, i)))
+        names.add(identity(index_tree(found, i)))
         if len(names) > top + SPARE:
             break
         chosen.append(i)
@@ -125,7 +123,3 @@ def traced_result(sim: Any, reward: Any, found: Traced) -> SearchResult:
     )
     best = index_tree(found.best, jnp.argmax(score))
     return finish_traced(sim, reward, tally, best, rewards)
-
-
-def _take(episodes: Episode, i: Any) -> Episode:
-    return Episode(*index_tree(tuple(episodes[:-1]), i))
