@@ -18,6 +18,7 @@ import numpy as np
 
 from jast._src.blackbox.worker import NAME, WrongAnswer, end_group
 from jast._src.core.typing import PathLike
+from jast._src.util.checks import wrong
 
 __all__ = ["program"]
 
@@ -109,10 +110,8 @@ def program(command: str | Sequence[str], *, folder: PathLike | None = None) -> 
     except (TypeError, ValueError):
         parts = ()
     if not parts or "\0" in "".join(parts):
-        raise ValueError(
-            "program: command must name a program, as a text that a shell could split or a sequence"
-            f" of texts, received {command!r}"
-        )
+        must = "name a program, as a text that a shell could split or a sequence of texts"
+        raise wrong("program", "command", must, f"{command!r}")
     if folder is not None and not (isinstance(folder, str | os.PathLike) and os.path.isdir(folder)):
         raise ValueError(f"program: folder must be a directory, received {folder!r}")
     # a relative path with a folder in it is looked up from where the program runs

@@ -24,7 +24,7 @@ from jast._src.distributions.containers import accepted
 from jast._src.distributions.special import Seeds
 from jast._src.runtime._jax import host_call
 from jast._src.runtime.host_errors import Asking, hosts_of
-from jast._src.util.checks import number, whole_number
+from jast._src.util.checks import number, whole_number, wrong
 from jast._src.util.pytrees import select, shapes_text
 
 __all__ = ["Record", "Standing", "calls", "from_python"]
@@ -215,9 +215,7 @@ def from_python(
                 " process cannot be stopped"
             )
     if likelihood not in (None, "log_prob", "prob"):
-        raise ValueError(
-            f'{NAME}: likelihood must be "log_prob", "prob" or None, received {likelihood!r}'
-        )
+        raise wrong(NAME, "likelihood", 'be "log_prob", "prob" or None', f"{likelihood!r}")
     if observe is not None and not callable(observe):
         raise ValueError(f"{NAME}: observe must be a function of the state, received {observe!r}")
     start = _start(start)
@@ -240,10 +238,8 @@ def from_python(
         )
     constant = D.is_distribution(disturbance)
     if not (constant or callable(disturbance)):
-        raise ValueError(
-            f"{NAME}: disturbance must be a distribution, or a function state -> distribution,"
-            f" received {disturbance!r}"
-        )
+        must = "be a distribution, or a function state -> distribution"
+        raise wrong(NAME, "disturbance", must, f"{disturbance!r}")
     blank = partial(_blank, episodic, horizon, like0, size)
     like = D.event_like(disturbance) if constant else _shape(disturbance, blank, like)
     runner.configure(_structure("disturbance", like), size)
@@ -294,10 +290,8 @@ def calls(sim: Simulator) -> Calls:
     """
     counts = [host.done for host in hosts_of(sim)]
     if not counts:
-        raise ValueError(
-            "calls: sim must be a simulator of jast.blackbox.from_python, received one that runs"
-            " nothing on the host"
-        )
+        must = "be a simulator of jast.blackbox.from_python"
+        raise wrong("calls", "sim", must, "one that runs nothing on the host")
     return Calls(*map(sum, zip(*counts)))
 
 
@@ -440,9 +434,7 @@ def _structure(name, like):
 
     structure = tree.unflatten(range(len(leaves)))
     if not plain(structure):
-        raise ValueError(
-            f"{NAME}: {name} must be an array or dicts, lists and tuples of arrays, received {tree}"
-        )
+        raise wrong(NAME, name, "be an array or dicts, lists and tuples of arrays", tree)
     return structure
 
 
@@ -450,10 +442,8 @@ def _start(start):
     if D.is_distribution(start := accepted(start)):
         return lambda: start
     if not callable(start) or not D.is_distribution(accepted(start())):
-        raise ValueError(
-            f"{NAME}: start must be a distribution, or a function () -> distribution, received"
-            f" {start!r}"
-        )
+        must = "be a distribution, or a function () -> distribution"
+        raise wrong(NAME, "start", must, f"{start!r}")
     return translating(start)
 
 
@@ -472,10 +462,8 @@ def _is_function(system, random, episodic):
     if not callable(system):
         an_object = any(hasattr(system, m) for m in METHODS)
         hint = "; give its class, or a function that makes it" if an_object else ""
-        raise ValueError(
-            f"{NAME}: system must be a function of the disturbances, or a class, received"
-            f" {system!r}{hint}"
-        )
+        must = "be a function of the disturbances, or a class"
+        raise wrong(NAME, "system", must, f"{system!r}{hint}")
     try:
         parameters = inspect.signature(system).parameters.values()
     except (TypeError, ValueError):  # one that Python knows nothing of
@@ -486,10 +474,8 @@ def _is_function(system, random, episodic):
         expected = "(disturbances), since no start distribution was given"
         if random:
             expected = "(disturbances, x0), since start is random"
-        raise ValueError(
-            f"{NAME}: system must be a function of {expected}, received"
-            f" {_name(system)}{inspect.signature(system)}"
-        )
+        must = f"be a function of {expected}"
+        raise wrong(NAME, "system", must, f"{_name(system)}{inspect.signature(system)}")
     if episodic is False:
         raise ValueError(
             f"{NAME}: episodic=False needs a class with the methods {', '.join(METHODS)};"

@@ -124,9 +124,7 @@ def attribution(
     g = episode_point.failing_point(name, sim, episode)
     quiet = g.evaluate(np.zeros((1, len(g.v)))).distance[0]
     if not np.isfinite(quiet):
-        raise ValueError(
-            f"{name}: sim must have a finite miss distance when it is undisturbed, received {quiet}"
-        )
+        raise checks.wrong(name, "sim", "have a finite miss distance when it is undisturbed", quiet)
     total = float(quiet - g.outcome.distance[0])
     error, cost = np.zeros(len(g.v)), 0
     if method == "shapley":
@@ -166,10 +164,8 @@ def _affordable(g: EpisodePoint, permutations: int, budget: int | None) -> int:
     each, spent = max(np.count_nonzero(g.v), 1), g.evaluate.spent + 1  # one run is made twice
     affordable = (budget - spent) // each // 2 * 2
     if affordable < 2:
-        raise ValueError(
-            f"attribution: budget must be at least {2 * each + spent}, two orders of {each}"
-            f" numbers, received {budget}"
-        )
+        must = f"be at least {2 * each + spent}, two orders of {each} numbers"
+        raise checks.wrong("attribution", "budget", must, budget)
     return min(permutations, affordable)
 
 

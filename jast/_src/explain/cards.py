@@ -59,10 +59,8 @@ def cards(
     p: Any = getattr(modes, "probability", None)
     chosen: Any = getattr(modes, "modes", modes)
     if not isinstance(chosen, Sequence) or not all(isinstance(m, Mode) for m in chosen):
-        raise ValueError(
-            f"{name}: modes must be a report of jast.stress, or what jast.search.modes returned,"
-            f" received {type(modes).__name__}"
-        )
+        must = "be a report of jast.stress, or what jast.search.modes returned"
+        raise checks.wrong(name, "modes", must, type(modes).__name__)
     chosen = list(chosen)[:MODES]
     # tilts are told by playing their draws again
     again = runs_on_host(sim) and isinstance(getattr(p and p.draws, "source", None), Tilts)

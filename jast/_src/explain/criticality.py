@@ -183,10 +183,8 @@ def _affordable_draws(budget: int | None, draws: int | None, steps: int) -> int:
     last = -(-budget // MOST_LANES) + 2
     affordable = min((budget - last) // states, DRAWS)
     if affordable < least:
-        raise ValueError(
-            f"criticality: budget must be at least {states * least + last}, {least} continuations"
-            f" of {states} states, received {budget}"
-        )
+        must = f"be at least {states * least + last}, {least} continuations of {states} states"
+        raise checks.wrong("criticality", "budget", must, budget)
     return affordable if draws is None else draws
 
 

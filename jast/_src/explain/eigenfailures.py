@@ -157,10 +157,8 @@ def eigenfailures(
         z, log_w, length, spent = z[rows], log_w[rows], length[rows], spent + len(ways)
     ess = float(effective_sample_size(log_w)) if len(z) else 0.0
     if ess < FAILURES:
-        raise ValueError(
-            f"{name}: failures must be at least {FAILURES} effective ones of the mode, received"
-            f" {ess:.3g}"
-        )
+        must = f"be at least {FAILURES} effective ones of the mode"
+        raise checks.wrong(name, "failures", must, f"{ess:.3g}")
     z = free_undecided(sim, z, length, numpy_generator(key)).astype(np.float64)
     # as late as the last of them: what was behind the end comes first
     last = int(length.max())

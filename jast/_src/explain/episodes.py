@@ -20,6 +20,7 @@ from jast._src.core.simulator import Simulator
 from jast._src.normal_space.transform import side_by_side
 from jast._src.runtime._jax import jit
 from jast._src.search.refine.modes import Mode
+from jast._src.util.checks import wrong
 from jast._src.util.pytrees import as_partial, index_tree, select_rows
 
 __all__ = [
@@ -76,10 +77,7 @@ def gather_episodes(function: str, argument: str, sim: Simulator, given: Any) ->
     if e.length.ndim == 0:
         e = index_tree(e, None)
     if e.length.ndim != 1:
-        raise ValueError(
-            f"{function}: {argument} must have one leading axis, received the shape"
-            f" {e.length.shape}"
-        )
+        raise wrong(function, argument, "have one leading axis", f"the shape {e.length.shape}")
     signature, n = signature_of(sim), len(e.length)
     for part, like, rows in (
         (e.x0, signature.x0, ()),
@@ -87,10 +85,8 @@ def gather_episodes(function: str, argument: str, sim: Simulator, given: Any) ->
     ):
         wanted = jax.tree.map(lambda s, rows=rows: (n, *rows, *s.shape), like)
         if jax.tree.map(np.shape, part) != wanted:
-            raise ValueError(
-                f"{function}: {argument} must be episodes of sim, with disturbances of the shapes"
-                f" {wanted}, received {jax.tree.map(np.shape, part)}"
-            )
+            must = f"be episodes of sim, with disturbances of the shapes {wanted}"
+            raise wrong(function, argument, must, jax.tree.map(np.shape, part))
     return e
 
 
@@ -106,10 +102,8 @@ def named_kinds(function: str, labels: Any, n: int) -> tuple[tuple[str, ...], np
     """The different names in ``labels``, and the number of that of each of ``n`` failures."""
     names, at = np.unique(np.asarray(labels).astype(str), return_inverse=True)
     if at.shape != (n,):
-        raise ValueError(
-            f"{function}: labels must be one for each of the {n} failures, received the shape"
-            f" {np.shape(labels)}"
-        )
+        must = f"be one for each of the {n} failures"
+        raise wrong(function, "labels", must, f"the shape {np.shape(labels)}")
     return tuple(names.tolist()), at
 
 
@@ -167,9 +161,7 @@ def observations(name: str, sim: Simulator, observe: Callable, e: Episode) -> np
     seen = side_by_side(sim, watched, *about, lanes=LANES)
     if not isinstance(seen, np.ndarray) or seen.ndim != 3:
         shapes = jax.tree.map(lambda a: np.shape(a)[2:], seen)
-        raise ValueError(
-            f"{name}: observe must return a vector [d], received arrays of the shapes {shapes}"
-        )
+        raise wrong(name, "observe", "return a vector [d]", f"arrays of the shapes {shapes}")
     return seen.astype(float)
 
 

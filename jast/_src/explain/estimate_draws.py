@@ -16,6 +16,7 @@ from jast._src.estimate.estimate import Estimate
 from jast._src.estimate.exceedance_and_times import draws_and_level
 from jast._src.estimate.redraw import dimension_of, redraw_failures
 from jast._src.normal_space import transform
+from jast._src.util.checks import wrong
 from jast._src.util.pytrees import index_tree
 
 __all__ = ["UNRELIABLE", "failing_draws", "free_undecided", "normalised"]
@@ -41,17 +42,13 @@ def failing_draws(
     """
     kept, _ = draws_and_level(name, estimate, None)
     if isinstance(kept.source, str) and kept.source != "model":
-        raise ValueError(
-            f"{name}: estimate must have drawn normal numbers, received one by {estimate.method}"
-            f" that drew by {kept.source}"
-        )
+        must = "have drawn normal numbers"
+        raise wrong(name, "estimate", must, f"one by {estimate.method} that drew by {kept.source}")
     if not kept.failure.any():
         raise ValueError(f"{name}: estimate must have seen a failure, received one that saw none")
     if (of := dimension_of(kept.source)) not in (None, d := transform.dimension(sim)):
-        raise ValueError(
-            f"{name}: sim must be the simulator of the estimate, with {of} random numbers in an"
-            f" episode, received one with {d}"
-        )
+        must = f"be the simulator of the estimate, with {of} random numbers in an episode"
+        raise wrong(name, "sim", must, f"one with {d}")
     return redraw_failures(sim, kept, most)
 
 

@@ -99,9 +99,7 @@ class Monitor(NamedTuple):
         x = np.asarray(observation, float)
         d = self.model.n_features_in_
         if x.ndim not in (1, 2) or x.shape[-1] != d:
-            raise ValueError(
-                f"probability: observation must be [{d}] or [n, {d}], received {list(x.shape)}"
-            )
+            raise checks.wrong("probability", "observation", f"be [{d}] or [n, {d}]", list(x.shape))
         p = self.model.predict_proba(np.atleast_2d(x))[:, 1]
         return float(p[0]) if x.ndim == 1 else p
 

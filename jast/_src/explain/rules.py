@@ -189,9 +189,7 @@ def rules(
     d = make_describer(sim, seen, of, lead)
     features, x = feature_table(sim, d, seen, _ends(rng, e, ends))
     if not np.isfinite(x).all():
-        raise ValueError(
-            f"{name}: disturbances and states must be finite, received some that are not"
-        )
+        raise checks.wrong(name, "disturbances and states", "be finite", "some that are not")
     out = hold_out(rng, owner, group, HELD_OUT)
     tree = grow_tree(trees, rng, x[~out], owner[~out], group[~out], most)
     said, leaf = tree.predict(x[out]), tree.apply(x[out])

@@ -113,9 +113,9 @@ def sensitivity(
     transform.check(name, sim)
     q = getattr(estimate, "proposal", None)
     if not is_proposal_of(sim, q):
-        raise ValueError(
-            f"{name}: estimate must be one by failure_probability that holds a proposal for this"
-            f" simulator, received {getattr(estimate, 'method', type(estimate).__name__)}"
+        must = "be one by failure_probability that holds a proposal for this simulator"
+        raise checks.wrong(
+            name, "estimate", must, getattr(estimate, "method", type(estimate).__name__)
         )
     called, values = _parameters(sim)
     if not called:

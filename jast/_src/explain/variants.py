@@ -18,6 +18,7 @@ from jast._src.normal_space.episode_point import turned_in_time
 from jast._src.normal_space.evaluate_points import PointEvaluator
 from jast._src.normal_space.pcn import proposed
 from jast._src.search.refine.modes import Modes, owners
+from jast._src.util.checks import wrong
 from jast._src.util.pytrees import index_tree, join_rows
 
 __all__ = ["EACH", "draw_variants", "find_seeds"]
@@ -70,10 +71,8 @@ def find_seeds(function: str, sim: Simulator, given: Any, labels: Any, most: int
         )
         return _label_by_mode(function, sim, found, modes)
     if isinstance(given, Estimate):
-        raise ValueError(
-            f"{function}: failures must be episodes, or an estimate for sim that drew normal"
-            f" numbers and saw failures, received one by {given.method} that did not"
-        )
+        must = "be episodes, or an estimate for sim that drew normal numbers and saw failures"
+        raise wrong(function, "failures", must, f"one by {given.method} that did not")
     of_mode = isinstance(given, Modes) and len(given) > 1
     e = gather_episodes(function, "failures", sim, given[:MODES] if of_mode else given)
     n = len(e.length)
