@@ -12,7 +12,7 @@ from jast._src.core import rewards
 from jast._src.core.episode import play_back
 from jast._src.distributions.flat_rows import flat
 from jast._src.heads.heads import observation
-from jast._src.util.pytrees import index_tree
+from jast._src.util.pytrees import index_tree, merge_axes
 
 __all__ = ["Samples", "cells", "samples_of_edges", "samples_of_episodes", "samples_of_roots"]
 
@@ -55,7 +55,7 @@ def samples_of_roots(sim, actions, roots, bins, good, first=0):
     edges = roots.visits > 0
     each = jnp.broadcast_to(seen[:, None], (*edges.shape, seen.shape[1]))
     use = roots.valid & (roots.depth >= first)
-    value = _finite_samples(*map(_merge, (use[:, None] & edges, each, x, roots.q)))
+    value = _finite_samples(*merge_axes((use[:, None] & edges, each, x, roots.q)))
     return policy, value
 
 
@@ -73,7 +73,7 @@ def samples_of_episodes(sim, actions, episodes, bins, good):
     state, all of the histogram in the cell of what came next.
     """
     seen, shares, use = _episode_rows(sim, actions, episodes._replace(states=None), bins)
-    return _policy_samples(*map(_merge, (use & good[:, None], seen, shares)))
+    return _policy_samples(*merge_axes((use & good[:, None], seen, shares)))
 
 
 @functools.partial(jax.jit, static_argnames="bins")
@@ -115,14 +115,9 @@ def _root_rows(sim, actions, roots, bins):
     return jax.vmap(one)(roots.state, roots.actions, roots.visits)
 
 
-def _merge(a):
-    """[n, m, ...] as [n * m, ...]."""
-    return a.reshape(-1, *a.shape[2:])
-
-
 def _tree_by_tree(rows):
     """Rows [n, B, ...] as [B * n, ...]."""
-    return jax.tree.map(lambda a: _merge(np.swapaxes(a, 0, 1)), rows)
+    return merge_axes(jax.tree.map(lambda a: np.swapaxes(a, 0, 1), rows))
 
 
 def _policy_samples(use, seen, shares):

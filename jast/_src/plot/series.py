@@ -21,7 +21,7 @@ from jast._src.search.refine.modes import Mode, Modes, owners
 from jast._src.search.result import SearchResult
 from jast._src.util.checks import instance, whole_number
 from jast._src.util.leaf_names import named_numbers
-from jast._src.util.pytrees import index_tree
+from jast._src.util.pytrees import index_tree, merge_axes
 from jast.estimate import FailureSamples
 
 __all__ = [
@@ -141,8 +141,7 @@ def series_of(sim: Simulator, episodes: Episode) -> Series:
     if isinstance(like, Standing):
         columns[DISTANCE] = np.where(there, np.asarray(states.distance, float), np.nan)
     elif not sim.episodic and not box:
-        flat = jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:]), states)
-        distance = np.asarray(far(sim, flat), float).reshape(there.shape)
+        distance = np.asarray(far(sim, merge_axes(states)), float).reshape(there.shape)
         columns[DISTANCE] = np.where(there, distance, np.nan)
     own = tuple(columns)
     late = jax.tree.map(lambda a: _from_step_1(a, sim.horizon), episodes.disturbances)

@@ -28,7 +28,7 @@ from jast._src.policies.actor import (
     network_inputs,
     parameter_shapes,
 )
-from jast._src.util.pytrees import index_tree, zero_where
+from jast._src.util.pytrees import index_tree, merge_axes, zero_where
 
 __all__ = ["Rates", "init_learner", "start_value", "train"]
 
@@ -174,7 +174,7 @@ def _batch(training, networks, rates, horizon, rows, valid):
         target=(advantage + value[:-1]) / unit,
         weight=weight,
     )
-    return jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:]), batch)
+    return merge_axes(batch)
 
 
 @functools.partial(jax.jit, static_argnames=("config", "steps", "epochs", "networks"))

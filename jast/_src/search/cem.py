@@ -38,7 +38,7 @@ from jast._src.search.refine.final import default_share, with_refine_share
 from jast._src.search.result import SearchResult, Trials
 from jast._src.search.setup import default_actions, prepare
 from jast._src.util import checks
-from jast._src.util.pytrees import index_tree
+from jast._src.util.pytrees import index_tree, merge_axes
 
 __all__ = ["cem"]
 
@@ -269,17 +269,15 @@ def _iteration(keys, sim, reward, actions, shares, plan, state, begin):
     keys = jax.vmap(lambda k: jax.vmap(partial(jax.random.fold_in, k))(number))(keys)
     rows = jax.vmap(lambda k, s: _propose(k, sim, shares, plan, s))(keys, state)
 
-    def flat(a):
-        return a.reshape(trees * samples, *a.shape[2:])
-
     def by_tree(tree):
         return jax.tree.map(lambda a: a.reshape(trees, samples, *a.shape[1:]), tree)
 
     of_start = make_draw(plan.kinds[0], choices.quantiles(), actions.draw_start)
     of_step = make_draw(plan.kinds[1], actions, actions.draw)
     live = jnp.ones((trees * samples,), bool)
-    level_first = jax.tree.map(lambda a: jnp.moveaxis(flat(a), 1, 0), rows)
-    played = play_lanes(sim, reward, flat(keys), of_start, of_step, live, level_first, record=True)
+    level_first = jax.tree.map(lambda a: jnp.moveaxis(a, 1, 0), merge_axes(rows))
+    keys = merge_axes(keys)
+    played = play_lanes(sim, reward, keys, of_start, of_step, live, level_first, record=True)
     tree = jnp.repeat(jnp.arange(trees, dtype=jnp.int32), samples)
     # trees run side by side
     tally = Tally.of(played, live, jnp.tile(number, trees) * trees + tree, tree, trees)
@@ -376,7 +374,7 @@ def _best_failures(elites, top):
     where there are fewer.
     """
     trees, k = elites.tag.shape
-    flat = jax.tree.map(lambda a: a.reshape(trees * k, *a.shape[2:]), elites._replace(latent=()))
+    flat = merge_axes(elites._replace(latent=()))
     failure, reward = flat.episode.failure, flat.episode.reward
     value = jnp.where(failure, reward, -jnp.inf)
     places, counts = distinct_episodes(failure, value, flat.tag, flat.number, flat.count, top)

@@ -15,7 +15,7 @@ from jast._src.normal_space.pcn import proposed
 from jast._src.normal_space.transform import dimension, normal_numbers, split_point, used_numbers
 from jast._src.runtime._jax import jit
 from jast._src.search.lanes import Played, Tally, in_blocks, play_lanes
-from jast._src.util.pytrees import index_tree, select_rows
+from jast._src.util.pytrees import index_tree, merge_axes, select_rows
 
 __all__ = ["Chains", "Points", "draw_wider", "move_chains", "no_points"]
 
@@ -80,9 +80,6 @@ def move_chains(key, sim, reward, best, chains, widths, begin, end):
     levels, each, d = chains.points.z.shape
     lanes, real = levels * each, chains.points.z.dtype
 
-    def flat(tree):
-        return jax.tree.map(lambda a: a.reshape(lanes, *a.shape[2:]), tree)
-
     def by_level(tree):
         return jax.tree.map(lambda a: a.reshape(levels, each, *a.shape[1:]), tree)
 
@@ -93,9 +90,9 @@ def move_chains(key, sim, reward, best, chains, widths, begin, end):
         scale, width = chains.scale[:, None, None], widths[:, None, None]
         moved = proposed(old.z, noise, scale, width), old.z + scale * width * noise
         z = jnp.where(old.failing[:, :, None], *moved)
-        played = play(sim, reward, flat(z), live)
+        played = play(sim, reward, merge_axes(z), live)
         best = best.merge(played, live, number)
-        new = by_level(_points(sim, flat(z), played, live))
+        new = by_level(_points(sim, merge_axes(z), played, live))
         nearer = ~old.failing & (new.distance <= old.distance)
         take = by_level(live & ~played.invalid) & (new.failing | nearer)
         share = jnp.mean(take, axis=1, dtype=real)

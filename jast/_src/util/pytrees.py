@@ -20,6 +20,7 @@ __all__ = [
     "index_tree",
     "join_rows",
     "map_in_lanes",
+    "merge_axes",
     "pad_rows",
     "select",
     "select_rows",
@@ -105,6 +106,11 @@ def index_tree(tree: Any, where: Any) -> Any:
 def join_rows(*trees: Any) -> Any:
     """The rows of trees of arrays, those of the first tree first. On the host."""
     return jax.tree.map(lambda *a: np.concatenate(a), *trees)
+
+
+def merge_axes(tree: Any) -> Any:
+    """The first two axes of each array as one: [n, m, ...] as [n m, ...]."""
+    return jax.tree.map(lambda a: a.reshape(a.shape[0] * a.shape[1], *a.shape[2:]), tree)
 
 
 def with_rows_of(like: jax.Array, tree: Any) -> Any:

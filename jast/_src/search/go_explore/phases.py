@@ -23,7 +23,7 @@ from jast._src.search.go_explore.continued_runs import (
     start_point,
 )
 from jast._src.search.lanes import Tally, in_blocks
-from jast._src.util.pytrees import index_tree, select, select_rows
+from jast._src.util.pytrees import index_tree, merge_axes, select, select_rows
 
 __all__ = ["Plan", "Traces", "improve_backward", "explore"]
 
@@ -82,7 +82,7 @@ def explore(key, sim, reward, cell, plan, cells, best, begin, end):
         seen = cells.seen.at[jnp.where(live & ~anew, slot, len(cells.seen))].add(1, mode="drop")
         good = (way[:, None] < new[None]) & ~points_on.progress.done[way] & live[None]
         # the points on the way [m, N] in a row, and the lane of each
-        rows = jax.tree.map(lambda a: a[way].reshape(good.size, *a.shape[2:]), points_on)
+        rows = merge_axes(index_tree(points_on, way))
         lane = jnp.tile(jnp.arange(plan.lanes, dtype=jnp.int32), len(way))
         new_ones = rows, good.reshape(-1), lane, (x0, played.episode.disturbances)
         cells = cells._replace(seen=seen)
