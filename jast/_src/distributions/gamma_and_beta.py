@@ -16,8 +16,6 @@ from jast._src.distributions.normal_tails import log_one_less, log_tails, normal
 from jast._src.distributions.numerically_inverted import newton
 from jast._src.distributions.tables import interpolated, serves, tail
 
-__all__ = ["beta_tails", "gamma_tails"]
-
 LEAST = 1e-290  # below it the first term of a series at 0 is exact
 NEAR = -12.0  # the logit below which the first terms of the series at 0 are exact enough
 
