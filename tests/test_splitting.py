@@ -166,6 +166,36 @@ def test_the_levels_are_unbiased_where_scores_tie(killed):
     assert error < 0.1 * Chain.probability()  # or it says nothing
 
 
+class Branches(Chain):
+    """Checks that no path and no family has more children than its share, but for one."""
+
+    def __init__(self, seed, n):
+        super().__init__(seed, n)
+        self.family, self.levels = np.arange(n), 0
+
+    def play(self, paths, parents, level):
+        if (parents != FRESH).all():
+            alive = np.setdiff1d(np.arange(self.n), paths)
+            for label in (np.arange(self.n), self.family):
+                had = np.bincount(label[parents], minlength=self.n)
+                share = np.bincount(label[alive], minlength=self.n) * len(paths) / len(alive)
+                assert (np.abs(had - share) < 1).all()
+            self.family[paths] = self.family[parents]
+            self.levels += 1
+        return super().play(paths, parents, level)
+
+    def score(self, s):
+        return math.inf if s >= self.top else float(s)  # five values: more levels
+
+
+@pytest.mark.parametrize("killed", [0.05, 0.25, 0.6])
+def test_families_have_children_in_proportion(killed):
+    paths = Branches(0, 300)
+    run = climb(np.random.default_rng(1), paths, killed)
+    assert run.ancestors == len(set(paths.family[[r[-1][1] >= Chain.top for r in paths.rows]]))
+    assert paths.levels == len(run.levels) >= 3
+
+
 def _nan_below(state):
     event, distance = beyond(state)
     return event, jnp.where(state < -1.0, jnp.nan, distance)

@@ -73,6 +73,7 @@ def climb(key, paths: Paths, killed: float = KILLED) -> Run:
     everyone = np.arange(n)
     first = paths.play(everyone, np.full(n, FRESH), -math.inf)
     top, ancestor, log_weight, levels = first.top.copy(), everyone.copy(), 0.0, []
+    place = everyone.copy()  # in a row in which families stand together
     branches, steps, invalid, undefined = 0, first.steps, first.invalid.sum(), first.undefined
     while True:
         level = np.partition(top, least - 1)[least - 1]
@@ -84,9 +85,16 @@ def climb(key, paths: Paths, killed: float = KILLED) -> Run:
         if log_weight < MIN_LOG_PROBABILITY:
             log_weight = -math.inf
             break
-        parents = rng.choice(alive, len(dead))
+        # systematic resampling (Carpenter, Clifford and Fearnhead 1999): all that are alive have as
+        # many children in the mean, and families in proportion, as what is alike stands together
+        ordered = alive[np.argsort(place[alive])]
+        at = len(alive) / len(dead) * (rng.random() + np.arange(len(dead)))
+        parents = ordered.take(at.astype(int), mode="clip")  # rounding may come to the end
         played = paths.play(dead, parents, float(level))
         top[dead], ancestor[dead] = played.top, ancestor[parents]
+        place = 2 * place
+        place[dead] = place[parents] + 1
+        place = np.argsort(np.argsort(place, kind="stable"))
         branches, steps = branches + len(dead), steps + played.steps
         invalid, undefined = invalid + played.invalid.sum(), undefined + played.undefined
     failing = top == math.inf if log_weight > -math.inf else np.zeros(n, bool)
