@@ -153,7 +153,7 @@ def test_the_gradient_of_the_likelihood_is_that_of_its_differences():
 
 def test_what_two_coordinates_do_together_becomes_an_axis():
     """A wave across the diagonal of the first two of four coordinates: after two turns an axis lies
-    along it, the wave's length is read off that axis alone, and errors are a tenth.
+    along it, the wave's length is read off that axis alone, and errors are a third or less.
     """
     across = np.array([1.0, -1.0, 0.0, 0.0]) / np.sqrt(2)
     wave = lambda z: 4.0 + np.sin(1.5 * z @ across) + 0.2 * z[:, 2]
@@ -168,7 +168,7 @@ def test_what_two_coordinates_do_together_becomes_an_axis():
     assert fitted.evidence > straight.evidence + 20
     truth = wave(new) / wave(z).std()
     errors = [np.abs(surrogate.predict(s, new)[0] - truth).mean() for s in (straight, fitted)]
-    assert errors[1] < 0.1 * errors[0]
+    assert errors[1] < errors[0] / 3
 
 
 def test_axes_say_nothing_where_all_lengthscales_are_equal():
@@ -192,10 +192,22 @@ def test_axes_say_nothing_where_all_lengthscales_are_equal():
     np.testing.assert_allclose(np.sqrt(np.diagonal(a)), sd, rtol=1e-6)
 
 
-def test_one_coordinate_has_one_axis():
-    z, y = np.linspace(-1, 1, 9)[:, None], np.linspace(2, 1, 9) ** 2
-    s = surrogate.fit(z, y, np.zeros(9, bool))
-    assert abs(surrogate.turned(s).axes) == [[1.0]]
+@pytest.mark.parametrize("n, d", [(9, 1), (1, 3), (2, 3)])
+def test_few_points_and_one_coordinate_have_axes(n, d):
+    """Of one point no slope varies: its axes are the coordinates."""
+    z = np.random.default_rng(0).standard_normal((n, d))
+    s = surrogate.turned(surrogate.fit(z, 2.0 + z[:, 0] ** 2, np.zeros(n, bool)))
+    np.testing.assert_allclose(s.axes @ s.axes.T, np.eye(d), atol=1e-12)
+    np.testing.assert_allclose(s.points, z @ s.axes.T, atol=1e-12)
+    if n == 1 or d == 1:
+        np.testing.assert_allclose(np.abs(s.axes), np.eye(d))
+
+
+def test_a_system_that_is_mostly_invalid_is_answered_with_few_calls(coarse):
+    """Nine tenths are NaN: with key 2 one call of the initial design is valid, or few are."""
+    g = lambda x: jnp.where(x[0] <= 1.28, jnp.nan, 3.0 - x[1])
+    found = failure_probability(jax.random.key(2), limit_state(Partial(g), 3), 60)
+    assert found.invalid > 0 and not found.reliable
 
 
 def test_the_sites_of_one_failure_match_the_moments_of_a_half_normal():

@@ -134,8 +134,8 @@ class UniformBox:
         0.25
     """
 
-    low: ArrayTree
-    high: ArrayTree
+    low: ArrayTree | float
+    high: ArrayTree | float
     places_start = False
     focus = 0.2  # a box knows nothing of the model
 
@@ -356,7 +356,7 @@ def wide(width: Numeric | None = None) -> Wide:
     return Wide(width)
 
 
-def uniform(low: ArrayTree, high: ArrayTree) -> UniformBox:
+def uniform(low: ArrayTree | float, high: ArrayTree | float) -> UniformBox:
     """Disturbances uniform on a box. The ferry's published actions are ``uniform(0., 1.)``.
 
     Args:

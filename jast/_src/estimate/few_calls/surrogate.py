@@ -6,8 +6,8 @@ ones) are half-lines; Gaussian sites stand for these by expectation propagation 
 Rasmussen and Williams 2006, Gaussian processes for machine learning, ch. 3.6), so that predictions
 are those of a regression. The covariance has a constant and a linear part, and Matern 5/2 with a
 lengthscale for each axis; hyperparameters climb the likelihood with the sites held. The axes are
-those along which the slope of a process fitted before varies most (active subspaces, Constantine
-2015, of the slope less its mean): what two coordinates do together is one of them.
+the coordinates, or turned to where the slope of a process fitted before varies most, as those of
+active subspaces (Constantine 2015): a combination of coordinates can then be one axis.
 """
 
 import math
@@ -28,8 +28,8 @@ ROUNDS = 2  # hyperparameters and sites are fitted in turn; a round costs `ASCEN
 ASCENTS = 8  # steps of the hyperparameters in a round
 FIRST_STEP = 0.15  # of the logarithm of each hyperparameter
 STEP_RANGE = 1e-3, 1.0  # least and greatest step
-TURNED = 0.5  # factor on a step whose gradient changed its sign (Riedmiller and Braun 1993)
-NOT_TURNED = 1.3  # factor on a step whose gradient did not
+SIGN_CHANGED = 0.5  # factor on a step whose gradient changed its sign (Riedmiller and Braun 1993)
+SIGN_KEPT = 1.3  # factor on a step whose gradient did not
 SWEEPS = 12  # of expectation propagation, at most
 DAMPING = 0.8  # part of the way to its new value that a site goes: moved at once, they overshoot
 CONVERGED = 0.01  # change of all means, in standard deviations, that ends the sweeps
@@ -87,8 +87,8 @@ class Surrogate(NamedTuple):
     warp: float
     """inf: none"""
     evidence: float
-    """Log probability of the distances and failures, times the prior of ``logs``; of other axes
-    than the coordinates less log(n) / 2 for each of their angles (Schwarz 1978)"""
+    """Log probability of the distances and failures, times the prior of ``logs``; of turned
+    axes less log(n) / 2 for each of their D (D - 1) / 2 angles (BIC, Schwarz 1978)"""
 
     @property
     def noise(self) -> float:
@@ -112,8 +112,8 @@ def fit(
     rounds: int = ROUNDS,
 ) -> Surrogate:
     """The `Surrogate` of points ``z`` [n, D] with ``distance`` [n] where not ``hidden`` [n], which
-    failed without saying how deep; ``before``: one of the first of them, to start from, whose axes
-    it has.
+    failed without saying how deep. ``before``: of the first of them, which gives the axes, and the
+    hyperparameters and sites to start from.
     """
     n, d = z.shape
     axes = np.eye(d) if before is None else before.axes
@@ -176,17 +176,18 @@ def posterior_covariance(surrogate: Surrogate, z: np.ndarray) -> np.ndarray:
 
 
 def turned(surrogate: Surrogate) -> Surrogate:
-    """What to start from with other axes: the eigenvectors of the covariance of its slopes, and the
-    lengthscales as they were along these.
+    """A start for `fit` with other axes: the eigenvectors of the covariance of the surrogate's
+    slopes, with the lengthscales as they were along these. It is no fit itself.
     """
     z, scale = surrogate.points, np.exp(surrogate.logs[3:])
     _, (r, e) = _covariance(z, z, surrogate.logs)
     # of Matern 5/2 by z_i: -5/3 (1 + r) e^-r (z_i - z'_i) / lengthscale_i^2
     by = -(5 / 3) * (1 + r) * e * surrogate.weights
     slopes = (by.sum(axis=1)[:, None] * z - by @ z) * scale**2
-    _, columns = np.linalg.eigh(np.atleast_2d(np.cov(slopes.T)))
+    slopes -= slopes.mean(axis=0)
+    _, columns = np.linalg.eigh(slopes.T @ slopes)
     logs = np.concatenate([surrogate.logs[:3], 0.5 * np.log(scale**2 @ columns**2)])
-    return surrogate._replace(axes=columns.T @ surrogate.axes, logs=logs)
+    return surrogate._replace(points=z @ columns, axes=columns.T @ surrogate.axes, logs=logs)
 
 
 def _covariance(a, b, logs):
@@ -268,7 +269,7 @@ def _climb(z, target, extra, hidden, logs, prior):
         if value > highest:
             highest, best = value, logs
         turn = np.sign(slope * last).astype(int)
-        step = np.clip(step * np.choose(1 + turn, (TURNED, 1, NOT_TURNED)), *STEP_RANGE)
+        step = np.clip(step * np.choose(1 + turn, (SIGN_CHANGED, 1, SIGN_KEPT)), *STEP_RANGE)
         logs, last = np.clip(logs + step * np.sign(slope), prior.low, prior.high), slope
     return best
 

@@ -48,8 +48,7 @@ SPREAD = 2.0
 """Factor on the variance beyond a plane: with it, and a fifth of wide copies at the same place, .45
 effective draws a draw where the plane is right, .21 where the boundary is .3 standard deviations
 nearer, .03 where it is .9 nearer (one dimension, 4.2 standard deviations out, by quadrature; with a
-factor of 1 the first two are .54 and .12). A fit to draws may take it back: standard errors of the
-planes, diffusions and lane of `benchmarks.few_calls` fall by an eighth."""
+factor of 1 the first two are .54 and .12). A fit to draws may bring the factor back to 1."""
 WIDE_SHARE = 0.3
 """Share of the wide copies. With it and the next number these are some .4, .21 and .065."""
 WIDE_NEARER = 0.5
@@ -164,7 +163,8 @@ def layers_as_latent(planes: Planes, layers: Layers, dtype: Any) -> Latent:
 
 def fit_layers(z: np.ndarray, log_weight: np.ndarray, planes: Planes, first: Layers) -> Layers:
     """Layers fitted to weighted failures ``z`` [n, D] by expectation maximisation: the shares, and
-    for all planes together by how much each layer is wider than the ``first``, and nearer.
+    for all planes together how much nearer each layer is than the ``first``, and the ratio of their
+    variances: at least that of what lies beyond a plane, and 1 for the wide layer.
     """
     x = (z.astype(np.float64) @ planes.normal.T)[:, None]  # [n, 1, K]
     w = np.exp(log_weight - log_weight.max())
@@ -179,13 +179,13 @@ def fit_layers(z: np.ndarray, log_weight: np.ndarray, planes: Planes, first: Lay
         n = part.sum(axis=(0, 2)) + PRIOR  # of each layer
         nearer = np.minimum((part * (x - first.mean)).sum(axis=(0, 2)) / n, 0.0)[:, None]
         square = (x - first.mean - nearer) ** 2 / first.variance
-        wider = ((part * square).sum(axis=(0, 2)) + PRIOR) / n
+        ratio = ((part * square).sum(axis=(0, 2)) + PRIOR) / n
         share = part.sum(axis=0) + PRIOR * first.share
         share /= share.sum(axis=1, keepdims=True)
         wide = max(n[1] / n.sum(), WIDE_SHARE)
         layers = Layers(
             np.array([[1 - wide], [wide]]) * share,
             first.mean + nearer,
-            first.variance * np.maximum(wider, 1 / SPREAD)[:, None],
+            first.variance * np.maximum(ratio, [1 / SPREAD, 1.0])[:, None],
         )
     return layers

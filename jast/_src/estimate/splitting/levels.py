@@ -73,7 +73,7 @@ def climb(key, paths: Paths, killed: float = KILLED) -> Run:
     everyone = np.arange(n)
     first = paths.play(everyone, np.full(n, FRESH), -math.inf)
     top, ancestor, log_weight, levels = first.top.copy(), everyone.copy(), 0.0, []
-    place = everyone.copy()  # in a row in which families stand together
+    place = everyone.copy()  # rank in an order in which each branch stands beside its parent
     branches, steps, invalid, undefined = 0, first.steps, first.invalid.sum(), first.undefined
     while True:
         level = np.partition(top, least - 1)[least - 1]
@@ -85,8 +85,8 @@ def climb(key, paths: Paths, killed: float = KILLED) -> Run:
         if log_weight < MIN_LOG_PROBABILITY:
             log_weight = -math.inf
             break
-        # systematic resampling (Carpenter, Clifford and Fearnhead 1999): all that are alive have as
-        # many children in the mean, and families in proportion, as what is alike stands together
+        # systematic resampling (Carpenter, Clifford and Fearnhead 1999): each that is alive has as
+        # many children as another in the mean, and a family as its size says, to within one
         ordered = alive[np.argsort(place[alive])]
         at = len(alive) / len(dead) * (rng.random() + np.arange(len(dead)))
         parents = ordered.take(at.astype(int), mode="clip")  # rounding may come to the end
