@@ -25,13 +25,14 @@ from benchmarks.closed_loops import JUDGED, system
 from benchmarks.first_minute import lane
 from benchmarks.limit_states import four_branch, four_branch_probability
 from benchmarks.probability import summary
+from benchmarks.ridges import RIDGES, ridge
 from benchmarks.sizes import add_choices, options, print_report, printer, size, timed
 from benchmarks.time_to_answer import gayton
 from jast._src.core.simulator import Simulator
 from jast.blackbox import from_python
 from jast.distributions import Joint, MultivariateNormalDiag, Normal, TruncatedNormal
 from jast.estimate import failure_probability
-from jast.simulators import limit_state
+from jast.simulators import landing, limit_state
 
 __all__ = ["SYSTEMS", "SlowLane", "System", "metaballs", "plane", "slow_lane"]
 
@@ -219,6 +220,7 @@ SYSTEMS = {
     "Booth": System(booth, 4.2964e-8, 999),
     "metaballs": System(lambda: limit_state(metaballs, 2), 1.12795e-5),
     "black box": System(black_box, 2.2227950662e-3),
+    "landing": System(landing, 4.0236721906842e-13),  # as `landing_probability` has it
     "four-branch, far": System(lambda: branches(10.0, 5.0), four_branch_probability(10.0, 5.0)),
 }
 # lane: `probability_of_lane` of tests/test_moments.py with 1.5 million draws, standard error .02 %;
@@ -250,6 +252,9 @@ FEWEST = {"plane 100, 300": System(partial(plane, 100), 2.3262908e-4, 300)}
 for name, (g, dimension, truth, budget) in LITERATURE.items():
     FEWEST[name] = System(partial(limit_state, g, dimension), truth, budget)
     FEWEST[f"{name}, signed"] = System(partial(signed, g, dimension), truth, budget)
+for number in RIDGES:
+    g, dimension, truth = ridge(number)
+    FEWEST[f"ridge {number}"] = System(partial(limit_state, g, dimension), truth, 250)
 QUICK = ["four-branch", "hyperplane 10", "lane, 2000", "plane 100", "diffusion 3, 50"]
 SYSTEMS |= FEWEST | MANY
 
