@@ -98,8 +98,8 @@ def rows_of(sim):
 
 
 def resample(log_w: np.ndarray, size: int, shift: float) -> np.ndarray:
-    """Rows [size], each as often as its weight asks, by the comb of ``shift`` in [0, 1)
-    (systematic resampling). On the host.
+    """Rows [size], each as often as its weight asks, to within one, by the comb of ``shift`` in
+    [0, 1) (systematic resampling, Carpenter, Clifford and Fearnhead 1999). On the host.
     """
     w = np.exp(log_w - log_w.max())
     at = (np.arange(size) + shift) / size

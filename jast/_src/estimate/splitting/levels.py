@@ -6,6 +6,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 from jast._src.core.counter_prng import numpy_generator
+from jast._src.estimate.proposal_search.mixture_draws import resample
 
 __all__ = ["FRESH", "Played", "Run", "climb"]
 
@@ -85,11 +86,10 @@ def climb(key, paths: Paths, killed: float = KILLED) -> Run:
         if log_weight < MIN_LOG_PROBABILITY:
             log_weight = -math.inf
             break
-        # systematic resampling (Carpenter, Clifford and Fearnhead 1999): each that is alive has as
-        # many children as another in the mean, and a family as its size says, to within one
+        # each that is alive has as many children as another in the mean, and a family as its size
+        # says, to within one
         ordered = alive[np.argsort(place[alive])]
-        at = len(alive) / len(dead) * (rng.random() + np.arange(len(dead)))
-        parents = ordered.take(at.astype(int), mode="clip")  # rounding may come to the end
+        parents = ordered[resample(np.zeros(len(alive)), len(dead), rng.random())]
         played = paths.play(dead, parents, float(level))
         top[dead], ancestor[dead] = played.top, ancestor[parents]
         place = 2 * place
