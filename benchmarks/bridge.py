@@ -15,6 +15,7 @@ from jax.tree_util import Partial
 
 import jast
 from benchmarks.ferry import REWARD
+from benchmarks.limit_states import DYNAMIC
 from benchmarks.sizes import options, print_report, printer, size
 from jast import cross_entropy as ce
 from jast.estimate import clopper_pearson, importance
@@ -59,9 +60,9 @@ SYSTEMS = {  # name -> simulator, truth
         lambda: jast.simulators.limit_state(Partial(_hyperplane, jnp.float32(6)), 20),
         9.865876450376946e-10,
     ),
-    "walk1d, one-sided": (lambda: jast.simulators.walk1d("one-sided"), 9.578759495e-4),
-    "walk1d, two-sided": (lambda: jast.simulators.walk1d(), 0.1087363323),
-    "landing (two modes)": (lambda: jast.simulators.landing(), 4.0236721906842e-13),
+    "walk1d, one-sided": DYNAMIC["walk1d one-sided"],
+    "walk1d, two-sided": DYNAMIC["walk1d two-sided"],
+    "landing (two modes)": DYNAMIC["landing"],
 }
 
 

@@ -23,7 +23,7 @@ from jax.tree_util import Partial
 
 from benchmarks.closed_loops import JUDGED, system
 from benchmarks.first_minute import lane
-from benchmarks.limit_states import four_branch, four_branch_probability
+from benchmarks.limit_states import DYNAMIC, four_branch, four_branch_probability
 from benchmarks.probability import summary
 from benchmarks.ridges import RIDGES, ridge
 from benchmarks.sizes import add_choices, options, print_report, printer, size, timed
@@ -32,7 +32,7 @@ from jast._src.core.simulator import Simulator
 from jast.blackbox import from_python
 from jast.distributions import Joint, MultivariateNormalDiag, Normal, TruncatedNormal
 from jast.estimate import failure_probability
-from jast.simulators import landing, limit_state
+from jast.simulators import limit_state
 
 __all__ = ["SYSTEMS", "SlowLane", "System", "metaballs", "plane", "slow_lane"]
 
@@ -220,7 +220,7 @@ SYSTEMS = {
     "Booth": System(booth, 4.2964e-8, 999),
     "metaballs": System(lambda: limit_state(metaballs, 2), 1.12795e-5),
     "black box": System(black_box, 2.2227950662e-3),
-    "landing": System(landing, 4.0236721906842e-13),  # as `landing_probability` has it
+    "landing": System(*DYNAMIC["landing"]),
     "four-branch, far": System(lambda: branches(10.0, 5.0), four_branch_probability(10.0, 5.0)),
 }
 # lane: `probability_of_lane` of tests/test_moments.py with 1.5 million draws, standard error .02 %;

@@ -24,7 +24,7 @@ import jast
 from benchmarks.sizes import options, print_report, printer, size
 from jast.simulators import autoregression, landing, limit_state, pendulum, ruin, walk1d
 
-__all__ = ["FAMILIES", "LIMITS", "Case", "Limit", "cases", "draw", "limit"]
+__all__ = ["DYNAMIC", "FAMILIES", "LIMITS", "Case", "Limit", "cases", "draw", "limit"]
 
 
 class Case(NamedTuple):

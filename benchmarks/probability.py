@@ -23,7 +23,7 @@ from scipy import stats
 
 import jast
 from benchmarks import reliability
-from benchmarks.limit_states import FAMILIES, Case, cases, draw
+from benchmarks.limit_states import DYNAMIC, FAMILIES, Case, cases, draw
 from benchmarks.literature import CASES as LITERATURE
 from benchmarks.markov_systems import CASES as MARKOV
 from benchmarks.sizes import add_choices, options, print_report, printer, size, timed
@@ -39,7 +39,7 @@ from jast.estimate import (
     trace_proposal,
 )
 
-LANDING = 4.0236721906842e-13
+LANDING = DYNAMIC["landing"][1]
 TRUTHS = {"landing": LANDING, "pendulum": 8.169e-3}
 PARTS = ("landing", "range", "policy", "default", "cases", "coverage")
 
