@@ -11,6 +11,7 @@ import numpy as np
 from jast._src.core.typing import Array
 
 __all__ = [
+    "MAX_SHARE_OF_ERROR",
     "MIN_ESS",
     "MIN_MODE_ESS",
     "MIN_MODE_SHARE",

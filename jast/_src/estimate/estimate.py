@@ -282,7 +282,7 @@ def estimate_from_weights(
     groups: Sequence[Sequence[int]] | None = None,
     control: int = 0,
     plain: tuple[int, int, int] = (0, 0, 0),
-    min_ess: int = diagnostics.MIN_ESS,
+    min_ess: int | None = diagnostics.MIN_ESS,
     **about: Any,
 ) -> Estimate:
     """The `Estimate` of `estimate.weight_sums.Sums`; ``reasons`` are more texts for which it is
@@ -291,7 +291,8 @@ def estimate_from_weights(
     ``evaluations``: episodes in all (default: those of ``sums``). ``groups``: lists of components
     that are one failure mode (default: each by itself). ``control``: episodes that were the model's
     own draws. ``plain``: (failing, invalid, episodes) of such draws beside those of ``sums``.
-    ``min_ess``: effective draws, of fewer than which it is UNRELIABLE.
+    ``min_ess``: effective draws, of fewer than which it is UNRELIABLE; None: the weights are not
+    judged.
     """
     n = sums.samples
     plain = tuple(a + b for a, b in zip(sums.plain, plain, strict=True))
@@ -316,10 +317,11 @@ def estimate_from_weights(
         ess = float(sums.first**2 / sums.second)
         k_hat = diagnostics.pareto_k(sums.tail, n, sums.failures)
         share = math.exp(sums.tail[0] - sums.top) / sums.first
-        found += diagnostics.weight_warnings(sums.failures, ess, k_hat, share, min_ess)
         groups = [[i] for i in range(len(sums.by_component))] if groups is None else groups
         modes, sizes = mode_shares(sums, groups)
-        found += diagnostics.mode_warnings(modes, sizes, relative)
+        if min_ess is not None:
+            found += diagnostics.weight_warnings(sums.failures, ess, k_hat, share, min_ess)
+            found += diagnostics.mode_warnings(modes, sizes, relative)
         if above > 1 + 4 * above * relative:
             found.append(
                 f"the estimate is {above:.4g}, above 1: a density does not fit its samples"

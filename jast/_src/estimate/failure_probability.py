@@ -111,12 +111,15 @@ def failure_probability(
     run for each number, or by gradients where it is judged at its end alone. Each moment then has a
     half-space of failure, whose depth a run or two correct and whose mirror image is tried.
     Failures of wide noise that none of them has lead to others. The proposal draws beyond these
-    half-spaces, nearer where the failures of three batches lie nearer. The audit is a small one: it
-    finds modes of a tenth of the probability or more. With some hundred episodes it is 40 draws of
-    wide noise, whose failures must come to lie where the proposal draws. Fewer than 30 effective
-    draws make such an estimate UNRELIABLE. Where such proposals do not serve, the other searches
-    have what is left, if that is 5000 episodes or more; else plain draws or subset simulation
-    answer, and mostly UNRELIABLE.
+    half-spaces, nearer where the failures of three batches lie nearer. Half of the last episodes
+    are spent on lines to the boundaries where these tell more than draws (line sampling,
+    Koutsourelakis, Pradlwarter and Schueller 2004), each corrected by a run at random, so that
+    boundaries need not be flat; draws and lines must agree. The audit is a small one: it finds
+    modes of a tenth of the probability or more. With some hundred episodes it is 40 draws of wide
+    noise, whose failures must come to lie where the proposal draws. Fewer than 30 effective draws
+    make an estimate without lines UNRELIABLE, and with them a relative standard error above 18 %.
+    Where such proposals do not serve, the other searches have what is left, if that is 5000
+    episodes or more; else plain draws or subset simulation answer, and mostly UNRELIABLE.
 
     A failure mode below ``unseen`` that all explorers miss is missing without a sign. A
     KeyboardInterrupt during the last part ends it with the estimate of the draws so far; before

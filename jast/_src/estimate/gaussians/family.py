@@ -132,7 +132,7 @@ class GaussianFamily(NamedTuple):
         for points, share in found:
             part = min(max(share / (1 + share), least), 1 - least)
             state = self.add(state, self.of_population(points), part)
-        return state
+        return state._replace(planes=None)  # they do not have what was missing
 
     def add(self, state: SearchState, g: Gaussians, share: float | None) -> SearchState:
         """The proposal with the `Gaussians` ``g`` for ``share`` of it; None: in place of it."""

@@ -32,6 +32,9 @@ HALVINGS = 4
 KNOWN = 0.15
 """Standard deviations to which the nearest boundary must be where its plane says: a probability at
 four of them is then known to a factor of two, and the draws tell the rest."""
+TURNED = 1.0
+"""Standard deviations between where it was linearised and the normal that this led to, from which
+it is done again there, unless that takes a run for each number."""
 ROUNDS = 6
 """Linearisations from one start at most; what is linear or nearly so took 2 to 4."""
 GIVEN = 4
@@ -72,7 +75,7 @@ def explore_moments(f: GaussianFamily, given: np.ndarray | None, gradients: bool
     state, planes = _with_mirror_images(f, state, half_spaces.that_matter(planes, f.dimension))
     depths = f"at {planes.depth.min():.3f} to {planes.depth.max():.3f}"
     state = state.note(f"moments: {len(planes.depth)} half-spaces {depths}")
-    return _fit_batches(f, state._replace(anchors=planes.nearest), planes)
+    return _fit_batches(f, state._replace(anchors=planes.nearest, planes=planes), planes)
 
 
 def _draw_model(f, state):
@@ -109,7 +112,8 @@ def _approach(f, state, planes, start, gradients, end):
         state, new = _to_their_roots(f, state, said, end)
         planes = half_spaces.merge_planes(planes, new)
         top = np.argmin(new.depth)
-        if abs(new.depth[top] - said.depth[top]) <= KNOWN:
+        turned = np.linalg.norm(start - (start @ new.normal[top]) * new.normal[top]) > TURNED
+        if abs(new.depth[top] - said.depth[top]) <= KNOWN and not (turned and cost < f.dimension):
             break
         last, start = start, INSIDE * new.nearest[top]
     return state, planes

@@ -25,6 +25,7 @@ from jast._src.estimate.monte_carlo import plain_traces, simulate_points
 from jast._src.estimate.proposal_search.adapt import adapt_proposal
 from jast._src.estimate.proposal_search.audit import audit_proposal
 from jast._src.estimate.proposal_search.final_draws import draw_estimate
+from jast._src.estimate.proposal_search.final_lines import add_lines, draw_half_by_lines
 from jast._src.estimate.proposal_search.search_state import (
     Family,
     SearchState,
@@ -133,7 +134,7 @@ def _answer(request, context, reasons):
     serves = first.suffices and is_efficient(first.state, s.family_efficiency)
     state, rest = first.state, request._replace(budget=request.budget - first.state.spent)
     if serves or rest.budget < s.moments_alone_budget:
-        return _draw(request, _audit(first) if serves else first, reasons)
+        return _draw_moments(request, _audit(first) if serves else first, reasons)
     return _after(state, _draw(rest, _search(rest, context), reasons))
 
 
@@ -267,6 +268,18 @@ def _audit(search):
     return Search(f, audit_proposal(f, state))
 
 
+def _draw_moments(request, search, reasons):
+    """The `Estimate` of what is left of the budget, where half-spaces are the proposal."""
+    state, lines = draw_half_by_lines(*search)
+    search = search._replace(state=state)
+    if lines is None:
+        return _draw(request, search, reasons)
+    watch = Watch(request.name, request.budget - state.spent, "episode", *request.watched)
+    min_ess = None if lines.alike else search.family.settings.min_ess
+    found = _draw_proposal(request, search, watch, [*reasons, *state.reasons], min_ess)
+    return add_lines(found, lines)
+
+
 def _draw(request, search, reasons):
     """The `Estimate` of what is left of the budget; ``reasons``: against it, whatever the search
     found: by the proposal, by levels or by plain draws.
@@ -285,7 +298,7 @@ def _draw(request, search, reasons):
             return _after(state, found)
     if search.suffices or (search.efficiency and not often):
         against = about_proposal if search.suffices else [*about_proposal, UNUSABLE]
-        return _draw_proposal(request, search, watch, against)
+        return _draw_proposal(request, search, watch, against, f.settings.min_ess)
     shared = key, sim, f.batch, n
     total, notes, lost = chunks(simulate_points, shared, f.batch, watch, request.placement)
     found = estimate_from_counts(
@@ -301,7 +314,7 @@ def _draw(request, search, reasons):
     return found._replace(draws=with_source(found.draws, key, f.batch, "model"))
 
 
-def _draw_proposal(request, search, watch, reasons):
+def _draw_proposal(request, search, watch, reasons, min_ess):
     """The `Estimate` by draws of the proposal, some of which are the model's own."""
     (f, state), s = search, request.settings
     surplus = 1 - 1 / (s.exact_error**2 * state.efficiency * watch.total)
@@ -320,7 +333,7 @@ def _draw_proposal(request, search, watch, reasons):
         plain=state.plain,
         level=request.level,
         history=state.history,
-        min_ess=f.settings.min_ess,
+        min_ess=min_ess,
     )
     return found._replace(proposal=search.proposal)
 

@@ -74,6 +74,8 @@ class SearchState(NamedTuple):
     """Of ``q``: effective draws of a draw"""
     anchors: np.ndarray | None = None
     """[m, D] design points that the proposal began with"""
+    planes: Any = None
+    """Half-spaces of failure that it began with: `estimate.gaussians.half_spaces.Planes`"""
     cooled: np.ndarray | None = None
     """[m, D] failures that wide noise led to"""
     given: Any = None
