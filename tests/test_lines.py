@@ -23,7 +23,7 @@ AXES = np.eye(3)
 
 def half_spaces(*depths, axes=AXES):
     k = len(depths)
-    return Planes(axes[:k], np.array(depths), np.zeros(k, int), np.ones(k), np.zeros(k))
+    return Planes(axes[:k], np.array(depths), np.zeros(k, int), np.ones(k))
 
 
 def total(planes, values):

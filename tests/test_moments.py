@@ -199,7 +199,7 @@ def test_layers_come_nearer_where_failures_lie_before_them(at, nearer):
     makes the narrow layer as narrow as the model beyond the plane, and not the wide one.
     """
     one = np.ones(1)
-    planes = half_spaces.Planes(np.eye(3)[:1], 4 * one, np.zeros(1, int), one, one)
+    planes = half_spaces.Planes(np.eye(3)[:1], 4 * one, np.zeros(1, int), one)
     first = half_spaces.first_layers(planes)
     z = np.random.default_rng(0).standard_normal((300, 3))
     z[:, 0] = at + 0.1 * z[:, 0]
@@ -215,7 +215,7 @@ def test_layers_come_nearer_where_failures_lie_before_them(at, nearer):
 def test_a_fit_to_the_model_beyond_a_plane_has_its_variance():
     """Exact draws of a normal number above 4, of variance .0532: the factor on it is given up."""
     one = np.ones(1)
-    planes = half_spaces.Planes(np.eye(2)[:1], 4 * one, np.zeros(1, int), one, one)
+    planes = half_spaces.Planes(np.eye(2)[:1], 4 * one, np.zeros(1, int), one)
     first = half_spaces.first_layers(planes)
     z = np.random.default_rng(0).standard_normal((2000, 2))
     z[:, 0] = truncnorm(4.0, np.inf).rvs(2000, random_state=1)

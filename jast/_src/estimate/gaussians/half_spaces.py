@@ -27,6 +27,7 @@ __all__ = [
     "first_layers",
     "fit_layers",
     "layers_as_latent",
+    "likely",
     "merge_planes",
     "no_planes",
     "planes_of",
@@ -69,8 +70,6 @@ class Planes(NamedTuple):
     moment: np.ndarray
     rate: np.ndarray
     """How much nearer to failing a standard deviation brings"""
-    gap: np.ndarray
-    """From where it was linearised to its nearest failing point"""
 
     @property
     def log_mass(self) -> np.ndarray:
@@ -96,7 +95,7 @@ class Layers(NamedTuple):
 
 def no_planes(d: int) -> Planes:
     """None of ``d`` numbers."""
-    return Planes(np.zeros((0, d)), np.zeros(0), np.zeros(0, int), np.zeros(0), np.zeros(0))
+    return Planes(np.zeros((0, d)), np.zeros(0), np.zeros(0, int), np.zeros(0))
 
 
 def planes_of(here: Linearised) -> Planes:
@@ -106,14 +105,15 @@ def planes_of(here: Linearised) -> Planes:
     normal = -here.slope[moment] / size[moment, None]
     beyond = here.distance[moment] / size[moment]
     depth = normal @ here.point + beyond
-    gap = np.linalg.norm(depth[:, None] * normal - here.point, axis=1)
-    return index_tree(Planes(normal, depth, moment, size[moment], gap), depth > 0)
+    return index_tree(Planes(normal, depth, moment, size[moment]), depth > 0)
 
 
 def merge_planes(old: Planes, new: Planes) -> Planes:
-    """Both; of two of one moment and side the one that was linearised nearer to its boundary."""
+    """Both; of two of one moment and side the nearer one: each is as deep as the system has it on
+    the ray to its design point, and so no nearer than the nearest failure.
+    """
     both = Planes(*map(np.concatenate, zip(old, new, strict=True)))
-    order = np.argsort(both.gap, kind="stable")
+    order = np.argsort(both.depth, kind="stable")
     kept: list[int] = []
     for i in order:
         same = [j for j in kept if both.moment[j] == both.moment[i]]
@@ -122,15 +122,19 @@ def merge_planes(old: Planes, new: Planes) -> Planes:
     return index_tree(both, np.sort(kept))
 
 
-def that_matter(planes: Planes, d: int) -> Planes:
-    """Those of great probability that differ from one another, as many as a proposal is to hold
-    with their wide copies.
-    """
+def likely(planes: Planes) -> Planes:
+    """Those of great probability."""
     mass = planes.log_mass
-    order = np.argsort(-mass, kind="stable")
-    order = order[mass[order] > mass.max() + math.log(LITTLE)]
-    most, kept = min(most_components(d) // 2, MOST), []
-    for i in order:
+    return index_tree(planes, mass > mass.max() + math.log(LITTLE))
+
+
+def that_matter(planes: Planes, d: int) -> Planes:
+    """The `likely` ones that differ from one another, as many as a proposal is to hold with their
+    wide copies.
+    """
+    planes, kept = likely(planes), []
+    most = min(most_components(d) // 2, MOST)
+    for i in np.argsort(-planes.log_mass, kind="stable"):
         if len(kept) < most and (planes.normal[kept] @ planes.normal[i]).max(initial=-1) < ALIKE:
             kept.append(i)
     return index_tree(planes, kept)

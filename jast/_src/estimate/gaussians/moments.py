@@ -72,10 +72,12 @@ def explore_moments(f: GaussianFamily, given: np.ndarray | None, gradients: bool
     if not len(planes.depth):
         return state.note("moments: no slope leads to failures")
     state, planes = _approach_wide(f, state, planes, gradients, end)
+    every = planes
     state, planes = _with_mirror_images(f, state, half_spaces.that_matter(planes, f.dimension))
+    every = half_spaces.likely(half_spaces.merge_planes(every, planes))
     depths = f"at {planes.depth.min():.3f} to {planes.depth.max():.3f}"
     state = state.note(f"moments: {len(planes.depth)} half-spaces {depths}")
-    return _fit_batches(f, state._replace(anchors=planes.nearest, planes=planes), planes)
+    return _fit_batches(f, state._replace(anchors=planes.nearest, planes=every), planes)
 
 
 def _draw_model(f, state):
