@@ -5,7 +5,8 @@ All in float64, but for the rows that say so. b_v: mean best value of the runs +
 error; d: mean distance to the optimum; F: sqrt(50) times the root of its mean square, which the
 thesis's b_d most likely is; hit: share of the runs that end in the global basin (below -0.0165, as
 no other minimum is). The table of the thesis is R. J. Moss's Table 2.1. Peers (`benchmarks.peers`)
-have the same budgets. ``--picture PATH`` draws the runs on 1A, 1B and 1C.
+have the same budgets. ``--picture PATH`` draws the runs on 1A, 1B and 1C, ``--sierra PATH`` sierra
+itself in the six settings of figure 2.1.
 """
 
 import functools
@@ -17,6 +18,7 @@ import numpy as np
 from benchmarks import peers
 from benchmarks.cases import CASES
 from benchmarks.engine import cpu
+from benchmarks.sierra_figure import sierra
 from benchmarks.sizes import options, print_report, printer, size, timed
 from jast import cross_entropy as ce
 from jast._src.cross_entropy.surrogates import RADIAL
@@ -161,7 +163,10 @@ def main(argv=None):
     )
     parser.add_argument("--surrogates", action="store_true", help="only the kinds of surrogate")
     parser.add_argument("--picture", metavar="PATH", help="draw the mean best value by evaluations")
+    parser.add_argument("--sierra", metavar="PATH", help="only draw figure 2.1 of the thesis")
     args = parser.parse_args(argv)
+    if args.sierra:
+        return sierra()[0].figure.savefig(args.sierra)
     jax.config.update("jax_enable_x64", True)
     seeds = args.seeds or size(args, 256, 64, 2)
     methods, modes = METHODS, ("thesis", "default")

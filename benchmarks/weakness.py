@@ -2,17 +2,17 @@
 of Moss's thesis, and reference figures on the same images).
 
 ``python -m benchmarks.weakness [--data FOLDER] [--json] [--quick | --smoke] [--seeds N] [--picture
-FILE]``. With ``--data``: the 10,000 MNIST test images of FOLDER (IDX files) and the published
-classifier in it (``sut_784x32x10.npz``: W1, b1, W2, b2), then three nearest neighbours and a random
-forest that were trained on the first half of the images and are validated on the other. Without:
-scikit-learn's digits, a third to train on and the rest to validate, and three classifiers, then a
-table whose failures are two clusters far apart. Means over seeds, +- one standard error of that
-mean. "difficulty" is the committee's word before any call; "pixels" the cross-validated logistic
-regression on 64 principal components that needs no call either. Failures found are shares of all
-of them, at budgets of 5, 10 and 25 % of the inputs; AUC and precision are those of the final scores
-on all inputs, where those that were run are judged by models that have not seen their outcome;
-candidates: as many as 627 of 10,000. "At most" is what the random calls guarantee of what is left.
-Seconds are of one validation, the first with compilation.
+FILE] [--table | --figures FOLDER]``. With ``--data``: the 10,000 MNIST test images of FOLDER (IDX
+files) and the published classifier in it (``sut_784x32x10.npz``: W1, b1, W2, b2), then three
+nearest neighbours and a random forest that were trained on the first half of the images and are
+validated on the other. Without: scikit-learn's digits, a third to train on and the rest to
+validate, and three classifiers, then a table whose failures are two clusters far apart. Means over
+seeds, +- one standard error of that mean. "difficulty" is the committee's word before any call;
+"pixels" the cross-validated logistic regression on 64 principal components that needs no call
+either. Failures found are shares of all of them, at budgets of 5, 10 and 25 % of the inputs; AUC
+and precision are those of the final scores on all inputs, where those that were run are judged by
+models that have not seen their outcome; candidates: as many as 627 of 10,000. "At most" is what the
+random calls guarantee of what is left. Seconds are of one validation, the first with compilation.
 """
 
 import json
@@ -28,6 +28,7 @@ from sklearn.model_selection import KFold, cross_val_predict
 from sklearn.neighbors import KNeighborsClassifier
 from sklearn.neural_network import MLPClassifier
 
+from benchmarks import weakness_figures
 from benchmarks.fms import mean, told
 from benchmarks.sizes import options, print_report, printer, size, timed
 from jast import plot, weakness
@@ -270,6 +271,10 @@ def main(argv=None):
         "--picture", help="draw the first system's failures found against calls into this file"
     )
     parser.add_argument("--table", action="store_true", help="only Table 4.1 of the thesis")
+    parser.add_argument(
+        "--figures",
+        help="only draw figures 4.3 to 4.6 of the thesis into this folder",
+    )
     args = parser.parse_args(argv)
     say, out, seeds = printer(args), {}, args.seeds or size(args, 10, 2, 1)
     one = args.quick or args.smoke
@@ -277,6 +282,11 @@ def main(argv=None):
     if args.table:
         tables([next(iter(systems))], seeds, out, say)
         return print_report(args, out)
+    if args.figures:
+        _, images, labels, predicted = next(iter(systems))
+        [(result, *_)] = runs(images, labels, predicted, "thesis", 1)
+        networks = weakness.encoded(result, images, labels)
+        return weakness_figures.draw(args.figures, result, networks, images, predicted != labels)
     for name, images, labels, predicted in systems:
         if args.smoke:
             images, labels, predicted = images[:80], labels[:80], predicted[:80]

@@ -9,11 +9,9 @@ readers; what matters is told by shape or words as well.
 Of any system: `traces`, `phase`, `failure_fan`, `disturbances`, `distances`; of a search `history`,
 `trials`, `trial_distances`; of its tree `tree`, and `tree_page`, an HTML file. Of one simulator:
 `ferry`; `fms`; `colav`, `colav_published`, `colav_story`, `colav_animation`. Of cross-entropy
-methods: `convergence`,
-`proposal_contours`, `surrogate_samples`, `sierra`. Of failure probabilities: `probability`,
-`exceedance`, `weights`, `levels`; against a setting: `sweep`. Of failure policies: `training`. Of
-weakness recognition: `failures_found`, `roc`, `first_failures`, `contributions`; of the thesis's
-adversary also `confusion`, `threshold_sweep`, `likely_failures`, `pixel_likelihood`.
+methods: `convergence`, `proposal_contours`, `surrogate_samples`. Of failure probabilities:
+`probability`, `exceedance`, `weights`, `levels`; against a setting: `sweep`. Of failure policies:
+`training`. Of weakness recognition: `failures_found`, `roc`, `first_failures`, `contributions`.
 """
 
 from jast._src.plot.colav import colav, colav_animation, colav_story
@@ -27,20 +25,13 @@ from jast._src.plot.ferry import ferry
 from jast._src.plot.fms import fms
 from jast._src.plot.probability import probability, weights
 from jast._src.plot.report import report
-from jast._src.plot.sierra import sierra
 from jast._src.plot.style import COLOURS, STYLE
 from jast._src.plot.traces import phase, traces
 from jast._src.plot.training import levels, training
 from jast._src.plot.tree import tree, tree_page
 from jast._src.plot.trials import trial_distances, trials
 from jast._src.plot.weakness import failures_found, roc
-from jast._src.plot.weakness_thesis import (
-    confusion,
-    likely_failures,
-    pixel_likelihood,
-    threshold_sweep,
-)
-from jast._src.util.doors import dir_function
+from jast._src.util.doors import dir_function, door
 
 __all__ = [
     "COLOURS",
@@ -49,7 +40,6 @@ __all__ = [
     "colav_animation",
     "colav_published",
     "colav_story",
-    "confusion",
     "contributions",
     "convergence",
     "disturbances",
@@ -62,17 +52,13 @@ __all__ = [
     "fms",
     "history",
     "levels",
-    "likely_failures",
     "phase",
-    "pixel_likelihood",
     "probability",
     "report",
     "proposal_contours",
     "roc",
-    "sierra",
     "sweep",
     "surrogate_samples",
-    "threshold_sweep",
     "traces",
     "training",
     "tree",
@@ -82,4 +68,14 @@ __all__ = [
     "weights",
 ]
 
+_FORMER = {
+    "confusion": "is now in benchmarks/weakness_figures.py of the repository",
+    "failure_grid": "is now jast.plot.first_failures",
+    "influence": "is now jast.plot.contributions",
+    "likely_failures": "is now in benchmarks/weakness_figures.py of the repository",
+    "pixel_likelihood": "is now in benchmarks/weakness_figures.py of the repository",
+    "sierra": "is now in benchmarks/sierra_figure.py of the repository",
+    "threshold_sweep": "is now in benchmarks/weakness_figures.py of the repository",
+}
+__getattr__ = door(__name__, former=_FORMER)
 __dir__ = dir_function(__all__)

@@ -156,3 +156,20 @@ def test_settings_of_matplotlib_are_left_alone():
 def test_pictures_are_on_the_door_without_matplotlib():
     code = "import sys, jast; jast.plot.history; sys.exit('matplotlib' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code]).returncode == 0
+
+
+@pytest.mark.parametrize(
+    "name, place",
+    [
+        ("confusion", "benchmarks/weakness_figures.py"),
+        ("likely_failures", "benchmarks/weakness_figures.py"),
+        ("pixel_likelihood", "benchmarks/weakness_figures.py"),
+        ("threshold_sweep", "benchmarks/weakness_figures.py"),
+        ("sierra", "benchmarks/sierra_figure.py"),
+        ("influence", "jast.plot.contributions"),
+        ("failure_grid", "jast.plot.first_failures"),
+    ],
+)
+def test_a_former_name_says_where_its_picture_is(name, place):
+    with pytest.raises(AttributeError, match=f"no attribute '{name}': it is now .*{place}"):
+        getattr(plot, name)

@@ -9,6 +9,7 @@ import pytest
 from matplotlib.patches import Ellipse
 from pictures import drawn, matplotlib, plt
 
+from benchmarks import sierra_figure
 from jast import cross_entropy as ce
 from jast import plot
 from jast.cross_entropy import (
@@ -231,14 +232,14 @@ def test_convergence_of_uneven_batches_and_of_values_that_are_missing():
 @pytest.mark.slow
 def test_sierra_is_drawn_as_printed():
     """Six panels; the least of the third is the optimum of Table 2.1."""
-    panels = plot.sierra()
+    panels = sierra_figure.sierra()
     assert len(panels) == 6 and "decay 1\nleast -0.0220" in panels[2].get_title("left")
     given = plt.figure().subplots(1, 2)
-    assert plot.sierra([(6, 1)], given, order="thesis") == [given[0]] and given[1].axison
+    assert sierra_figure.sierra([(6, 1)], given, order="thesis") == [given[0]] and given[1].axison
     assert "-0.0220" in given[0].get_title("left")
     for settings in ([], [3], 7):
         with pytest.raises(ValueError, match="settings must be pairs"):
-            plot.sierra(settings)
+            sierra_figure.sierra(settings)
 
 
 def test_given_axes_are_used_and_settings_left_alone():

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from systems import mark_long
 
-from jast import plot
+from benchmarks import weakness_figures as figures
 from jast._src.weakness.data import check_data
 from jast._src.weakness.features import scale_inputs
 from jast._src.weakness.networks import (
@@ -249,14 +249,14 @@ def test_the_autoencoder_comes_back_from_the_key(encoded_digits):
 def test_the_thesis_figures(encoded_digits):
     result, inputs, _, failed, networks = encoded_digits
     middle = float(np.median(result.scores))
-    ax = plot.confusion(result, failed, middle)
+    ax = figures.confusion(result, failed, middle)
     numbers = [int(text.get_text()) for text in ax.texts]
     chosen = result.scores >= middle
     assert sum(numbers) == 240 and numbers[3] == np.sum(failed & chosen)
     assert f"recall {numbers[3] / failed.sum():.3f}" in ax.get_title("left")
-    precision, recall = plot.threshold_sweep(result, failed, thresholds=5).lines[:2]
+    precision, recall = figures.threshold_sweep(result, failed, thresholds=5).lines[:2]
     assert recall.get_ydata()[0] == 1 and precision.get_ydata()[0] == np.mean(failed)
-    axes = plot.likely_failures(networks, inputs, failed, "likely failures", count=4)
+    axes = figures.likely_failures(networks, inputs, failed, "likely failures", count=4)
     assert len(axes) == 12 and axes[0].get_title("left").startswith(f"{networks.scores.max():.3f}")
     np.testing.assert_allclose(
         axes[8].images[0].get_array(),
@@ -265,17 +265,40 @@ def test_the_thesis_figures(encoded_digits):
     )
     lone = np.zeros((1, 64), np.float32)
     lone[0, 9] = 1
-    shown = plot.pixel_likelihood(networks).images[0].get_array()
+    shown = figures.pixel_likelihood(networks).images[0].get_array()
     np.testing.assert_allclose(shown[1, 1], networks.score(lone)[0], rtol=1e-5)
     for refused, message in (
-        (lambda: plot.pixel_likelihood(result), "networks must be jast.weakness.encoded"),
-        (lambda: plot.likely_failures(networks, inputs, failed, "all"), "kind must be one of"),
-        (lambda: plot.likely_failures(networks, inputs[0], failed), "inputs must be the images"),
-        (lambda: plot.confusion(result, failed, 2.0), "threshold must be a number in 0 .. 1"),
-        (lambda: plot.threshold_sweep(result, failed, 1), "thresholds must be a whole number"),
+        (
+            lambda: figures.pixel_likelihood(result),
+            "networks must be jast.weakness.encoded",
+        ),
+        (
+            lambda: figures.likely_failures(networks, inputs, failed, "all"),
+            "kind must be one of",
+        ),
+        (
+            lambda: figures.likely_failures(networks, inputs[0], failed),
+            "inputs must be the images",
+        ),
+        (
+            lambda: figures.confusion(result, failed, 2.0),
+            "threshold must be a number in 0 .. 1",
+        ),
+        (
+            lambda: figures.threshold_sweep(result, failed, 1),
+            "thresholds must be a whole number",
+        ),
     ):
         with pytest.raises(ValueError, match=message):
             refused()
+
+
+@pytest.mark.slow
+def test_the_thesis_figures_are_files(encoded_digits, tmp_path):
+    result, inputs, _, failed, networks = encoded_digits
+    figures.draw(tmp_path / "new", result, networks, inputs, failed)
+    names = sorted(path.name for path in (tmp_path / "new").iterdir())
+    assert names == [f"figure_{number}.png" for number in ("4.3b", "4.4b", "4.5", "4.6")]
 
 
 @pytest.mark.long

@@ -12,12 +12,15 @@ from typing import Any
 __all__ = ["door", "dir_function"]
 
 
-def door(package: str, lazy: Mapping[str, str]) -> Callable[[str], Any]:
+def door(
+    package: str, lazy: Mapping[str, str] = {}, former: Mapping[str, str] = {}
+) -> Callable[[str], Any]:
     """The ``__getattr__`` of ``package``.
 
     Args:
         package: the package's ``__name__``.
         lazy: name -> where it is, as "module" or "module:attribute"; looked up once, at first use.
+        former: a name of an earlier version -> what became of it, as "is now jast.plot.roc".
 
     Returns:
         A function of a name: the thing of that name.
@@ -31,7 +34,8 @@ def door(package: str, lazy: Mapping[str, str]) -> Callable[[str], Any]:
             value = _found(lazy[name])
             setattr(sys.modules[package], name, value)
             return value
-        raise AttributeError(f"module {package!r} has no attribute {name!r}")
+        became = f": it {former[name]}" if name in former else ""
+        raise AttributeError(f"module {package!r} has no attribute {name!r}{became}")
 
     return getattribute
 

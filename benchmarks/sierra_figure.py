@@ -1,17 +1,13 @@
-"""Sierra for several of its settings: figure 2.1 of Moss's thesis."""
-
-from __future__ import annotations
-
-from collections.abc import Sequence
-from typing import Any
+"""Figure 2.1 of R. J. Moss's thesis: sierra in several of its settings. ``python -m
+benchmarks.cross_entropy --sierra PATH`` draws it.
+"""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jast._src.cross_entropy.objectives import sierra as objective
+from jast import cross_entropy as ce
 from jast._src.plot import style
-from jast._src.plot.style import Axes
 
 __all__ = ["sierra"]
 
@@ -19,29 +15,14 @@ SIDE = 15.0  # the picture reaches from -15 to 15, as the figure
 POINTS = 161  # of a side
 LEVELS = 24  # of colour
 PUBLISHED = tuple((sharpness, decay) for decay in (1.0, 0.0) for sharpness in (0.5, 2.0, 6.0))
-"""The panels of figure 2.1."""
 
 
-def sierra(
-    settings: Any = PUBLISHED, axes: Sequence[Axes] | None = None, **others: Any
-) -> list[Axes]:
-    """Sierra (`jast.cross_entropy.sierra`) on [-15, 15] x [-15, 15], a panel for each pair of
-    settings: figure 2.1 of the thesis. The brighter, the lower; each panel has its own scale, from
-    0 to the least value, which its title says.
+def sierra(settings=PUBLISHED, axes=None, **others):
+    """A panel for each pair (sharpness eta, decay), and the list of their Axes. The brighter, the
+    lower; each panel has its own scale, from 0 to the least value, which its title says.
 
-    Args:
-        settings: pairs (``sharpness`` eta, ``decay``). Default: the six of the figure, eta .5, 2
-            and 6 with decay 1, then with decay 0.
-        axes: Axes to draw in, at least one for each pair; None: a new figure, three panels a row.
-        others: further settings of `jast.cross_entropy.sierra`, of all panels, as ``spacing=3.0``.
-
-    Raises:
-        ValueError: for settings that are no pairs, those that sierra refuses, and too few axes.
-
-    Example:
-        >>> import jast
-        >>> len(jast.plot.sierra([(6.0, 1.0)]))
-        1
+    ``axes``: to draw in; None: a new figure. ``others``: further settings of
+    `jast.cross_entropy.sierra`, of all panels.
     """
     try:
         pairs = [(float(eta), float(decay)) for eta, decay in settings]
@@ -56,7 +37,7 @@ def sierra(
     shared, count = dict(sharey=True, layout="compressed"), len(pairs)
     with style.panels("sierra", axes, size, count, "pair of settings", columns, **shared) as axes:
         for ax, (eta, decay) in zip(axes, pairs, strict=True):
-            f = objective(sharpness=eta, decay=decay, **others)
+            f = ce.sierra(sharpness=eta, decay=decay, **others)
             value = np.asarray(jax.vmap(f)(plane), float).reshape(POINTS, POINTS)
             levels = np.linspace(value.min(), 0, LEVELS + 1)
             ax.contourf(line, line, value, levels, cmap="cividis_r")
