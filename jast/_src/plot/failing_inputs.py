@@ -31,7 +31,7 @@ def first_failures(
     axes: Sequence[Axes] | None = None,
 ) -> list[Axes]:
     """The first failures found, a tile each: what the system said, what it is, and the input's
-    number. Figure 4.5 of the thesis is `likely_failures`.
+    number.
 
     Args:
         result: a `jast.weakness.Result`.
@@ -111,7 +111,7 @@ def contributions(
     ax: Axes | None = None,
 ) -> Axes:
     """Which features mark the weakness: the mean magnitude of their contributions to the log odds
-    of failure. Figure 4.6 of the thesis is `pixel_likelihood`.
+    of failure.
 
     Images are drawn as a map, whose magnitudes are summed over the channels. Of rows of a table the
     15 columns of the greatest mean magnitude are drawn, with the mean of the signed contributions,
