@@ -15,7 +15,7 @@ import jast
 from jast import actions
 from jast import distributions as D
 from jast._src.core import nominal
-from jast._src.core.check import contract
+from jast._src.core.contract import contract
 from jast._src.util.intervals import clopper_pearson
 from jast.simulators import ferry, landing, limit_state, walk1d
 

@@ -20,7 +20,7 @@ from jax.tree_util import Partial
 from jast import distributions as D
 from jast._src.adapters.noise import Random, disturbed, model_of, random, replaced
 from jast._src.adapters.state_arrays import as_numbers, free_to_move, in_dtypes_of, with_keys
-from jast._src.core.check import OBSERVED
+from jast._src.core.contract import OBSERVED
 from jast._src.core.simulator import Simulator, fixed, ravel
 from jast._src.core.typing import Array, DistributionLike, Numeric
 from jast._src.util.checks import wrong

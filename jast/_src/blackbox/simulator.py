@@ -17,7 +17,7 @@ from jast import distributions as D
 from jast._src.blackbox.host_calls import Calls, Host
 from jast._src.blackbox.pool import Pool, pack
 from jast._src.blackbox.worker import METHODS, Runner, Spec, takes
-from jast._src.core.check import OBSERVED
+from jast._src.core.contract import OBSERVED
 from jast._src.core.simulator import Simulator, fixed, translating
 from jast._src.core.typing import Array, ArrayTree, DistributionLike, Disturbance, Start
 from jast._src.distributions.containers import accepted

@@ -16,7 +16,7 @@ from jax import lax
 
 from jast import distributions as D
 from jast._src.core import rewards
-from jast._src.core.check import contract
+from jast._src.core.contract import contract
 from jast._src.core.episode import Episode, rollout
 from jast._src.core.policy import undisturbed
 from jast._src.core.signature import signature_of

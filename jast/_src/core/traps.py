@@ -10,6 +10,7 @@ from jax import lax
 from jax.custom_derivatives import SymbolicZero
 
 from jast import distributions as D
+from jast._src.core.contract import leaf_path
 from jast._src.core.float_resolution import describe
 from jast._src.core.probe import Resolution
 from jast._src.core.signature import per_simulator, signature_of
@@ -78,10 +79,10 @@ def _fixed_keys(state: Any, seen: Resolution, keys: tuple[bool, ...]) -> Iterato
     for (path, leaf), key, still in zip(leaves, keys, seen.unmoved, strict=True):
         if key and still and not _is_ours(leaf):
             yield (
-                f"init: state leaf {jax.tree_util.keystr(path) or '(the whole)'} looks like a"
-                " random key that no disturbance reaches: the simulator's own noise is the same in"
-                " every episode. Draw this noise in disturbance, or make the seed a disturbance"
-                " (jast.distributions.seeds) and fold it into the key (jax.random.fold_in)"
+                f"init: state leaf {leaf_path(path)} looks like a random key that no disturbance"
+                " reaches: the simulator's own noise is the same in every episode. Draw this noise"
+                " in disturbance, or make the seed a disturbance (jast.distributions.seeds) and"
+                " fold it into the key (jax.random.fold_in)"
             )
 
 

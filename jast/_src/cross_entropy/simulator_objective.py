@@ -16,7 +16,7 @@ from jax.tree_util import Partial
 
 from jast._src.core import failures
 from jast._src.core.actions import Quantiles, UniformBox, quantiles
-from jast._src.core.check import contract
+from jast._src.core.contract import contract
 from jast._src.core.episode import Episode, rollout
 from jast._src.core.failures import Failures
 from jast._src.core.rewards import LogLikelihood, as_pytree

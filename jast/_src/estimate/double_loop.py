@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 from jax.scipy.special import logsumexp
 
-from jast._src.core.check import contract
+from jast._src.core.contract import contract
 from jast._src.core.policy import Policy
 from jast._src.core.simulator import Simulator
 from jast._src.core.typing import Callback, PRNGKey

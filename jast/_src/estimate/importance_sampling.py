@@ -19,7 +19,7 @@ from jax import lax
 from jax.scipy.special import logsumexp
 
 from jast import distributions as D
-from jast._src.core.check import contract
+from jast._src.core.contract import contract
 from jast._src.core.episode import rollout
 from jast._src.core.policy import Policy, nominal_policy
 from jast._src.core.rewards import log_likelihood

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from jast._src.core.check import contract
+from jast._src.core.contract import contract
 from jast._src.core.nominal import outcome
 from jast._src.core.rewards import log_likelihood
 from jast._src.core.signature import signature_of

@@ -17,7 +17,7 @@ import numpy as np
 from jax.tree_util import Partial
 
 from jast import distributions as D
-from jast._src.core.check import contract
+from jast._src.core.contract import contract
 from jast._src.core.episode import Episode
 from jast._src.core.policy import Policy
 from jast._src.core.signature import ask, signature_of

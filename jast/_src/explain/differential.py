@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jax.tree_util import Partial
 
 from jast import distributions as D
-from jast._src.core.check import contract
+from jast._src.core.contract import contract
 from jast._src.core.signature import signature_of
 from jast._src.core.simulator import Simulator, first_state, next_state
 from jast._src.core.typing import Array, PRNGKey

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jast import distributions as D
-from jast._src.core.check import contract
+from jast._src.core.contract import contract, first_line
 from jast._src.core.signature import ask, signature_of
 from jast._src.core.simulator import Simulator
 from jast._src.heads.heads import (
@@ -117,10 +117,9 @@ def _check_outputs(heads, n, d):
         try:
             out = jax.eval_shape(run)
         except Exception as e:  # of whatever framework
-            why = (str(e) or type(e).__name__).splitlines()[0]
             raise ValueError(
                 f"heads: the {name} head's apply(params, x) failed on x of shape ({takes},)"
-                f" float32: {why}"
+                f" float32: {first_line(e)}"
             ) from e
         shape = getattr(out, "shape", None)
         fits = shape is not None and (

@@ -20,7 +20,7 @@ from jax import lax
 
 from jast import distributions as D
 from jast._src.core import actions, rewards
-from jast._src.core.check import contract
+from jast._src.core.contract import contract
 from jast._src.core.episode import Episode, play_back, play_chosen
 from jast._src.core.policy import Policy
 from jast._src.core.rewards import likelihood

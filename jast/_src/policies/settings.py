@@ -4,7 +4,7 @@ import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-from jast._src.core.check import OBSERVED, contract
+from jast._src.core.contract import OBSERVED, contract
 from jast._src.core.signature import signature_of
 from jast._src.core.simulator import Simulator
 from jast._src.policies.actor import count_latents

@@ -7,7 +7,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from jast._src.core.check import OBSERVED, contract
+from jast._src.core.contract import OBSERVED, contract
 from jast._src.core.signature import signature_of
 from jast._src.io.codec import Given, check_fits
 from jast._src.io.npz import misfit

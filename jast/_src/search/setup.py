@@ -9,7 +9,7 @@ import jax
 
 from jast._src.core import actions as choices
 from jast._src.core import rewards
-from jast._src.core.check import ACTIONS, contract
+from jast._src.core.contract import ACTIONS, contract
 from jast._src.core.signature import signature_of
 from jast._src.core.simulator import Simulator
 from jast._src.runtime._jax import is_traced, is_tracing

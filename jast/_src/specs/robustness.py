@@ -18,6 +18,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jast._src.core.contract import first_line
 from jast._src.runtime._jax import is_traced
 from jast._src.specs import sliding_windows
 from jast._src.specs.formulas import (
@@ -242,8 +243,8 @@ def _margin(function: str, p: Predicate, trace: Any) -> jax.Array:
     try:
         jax.eval_shape(lambda state: found.append(p.margin(state)), one)
     except Exception as e:
-        said = (str(e).strip() or type(e).__name__).splitlines()[0]
-        raise ValueError(f"{function}: {p}: the predicate raised {type(e).__name__}: {said}") from e
+        raised = f"{type(e).__name__}: {first_line(e)}"
+        raise ValueError(f"{function}: {p}: the predicate raised {raised}") from e
     (value,) = found
     array = isinstance(value, jax.Array | np.ndarray | np.generic | int | float)
     dtype = jnp.result_type(value) if array else None

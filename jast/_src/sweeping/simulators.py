@@ -9,7 +9,7 @@ import jax
 import numpy as np
 from jax.tree_util import Partial
 
-from jast._src.core.check import contract
+from jast._src.core.contract import contract
 from jast._src.core.simulator import Simulator
 from jast._src.runtime.host_errors import runs_on_host
 

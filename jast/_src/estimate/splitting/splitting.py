@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jast._src.core.check import contract
+from jast._src.core.contract import contract
 from jast._src.core.float_resolution import rounding_problem
 from jast._src.core.signature import signature_of
 from jast._src.core.simulator import Simulator

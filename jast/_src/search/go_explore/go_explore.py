@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from jast._src.core.check import contract
+from jast._src.core.contract import contract
 from jast._src.core.counter_prng import tree_keys
 from jast._src.core.episode import Episode
 from jast._src.core.rewards import as_pytree
