@@ -5,7 +5,8 @@ NumPy, external programs, Gymnasium environments.
 from jast._src.blackbox.environment import Moment, gymnasium_system
 from jast._src.blackbox.host_calls import Calls
 from jast._src.blackbox.programs import program
-from jast._src.blackbox.simulator import Record, Standing, calls, from_python
+from jast._src.blackbox.simulator import calls, from_python
+from jast._src.blackbox.states import Record, Standing
 
 __all__ = [
     "Calls",

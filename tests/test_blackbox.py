@@ -17,7 +17,8 @@ from systems import TOLD
 
 import jast
 from jast import blackbox
-from jast._src.blackbox import answers, worker
+from jast._src.blackbox import answers, readings, worker
+from jast._src.blackbox.rows import Spec
 from jast._src.core.rewards import STANDARD
 from jast._src.estimate.tilts.exploration import numbers_of_episodes
 from jast._src.runtime.host_errors import GROUPS, Log, hosts_of, new_incidents
@@ -704,7 +705,7 @@ def test_objects_serve_many_episodes(monkeypatch):
     """One for each history that goes on, and those that ended are used again."""
     for episodic, most in ((True, 1), (False, 4)):
         Counted.made = 0
-        spec = worker.Spec(False, episodic, 3, (), False, None)
+        spec = Spec(False, episodic, 3, (), False, None)
         runner = worker.Runner(Counted, spec)
         runner.configure(0, 0)
         rows = np.random.default_rng(0).normal(size=(4, 3))
@@ -776,4 +777,4 @@ def test_a_folder_beside_the_package_is_the_users_own():
     exec(code, names := {})
     with pytest.raises(ZeroDivisionError) as raised:
         names["step"]()
-    assert worker.line_of(raised.value) == " (system.py:4)"
+    assert readings.line_of(raised.value) == " (system.py:4)"

@@ -19,8 +19,9 @@ import pytest
 
 import jast
 from jast import blackbox
-from jast._src.blackbox import pool, worker
 from jast._src.blackbox.pool import Pool
+from jast._src.blackbox.rows import Spec
+from jast._src.blackbox.worker_process import Worker, pack
 from jast._src.runtime.host_errors import hosts_of
 from jast.distributions import Normal
 from jast.incidents import incidents
@@ -334,8 +335,8 @@ def asked(pool, first):
 
 
 def alone(system, limit=None):
-    spec = worker.Spec(run=False, episodic=True, horizon=1, x0=(), random=False, limit=limit)
-    return Pool(pool.pack(system, spec), 1, spec, 0, 0)
+    spec = Spec(run=False, episodic=True, horizon=1, x0=(), random=False, limit=limit)
+    return Pool(pack(system, spec), 1, spec, 0, 0)
 
 
 def test_what_a_worker_said_before_is_no_answer():
@@ -376,7 +377,7 @@ def test_bad_input_is_named(monkeypatch):
         box(lambda: type("Mute", (blackboxes.Walk,), {"is_event": None})())
     monkeypatch.setitem(sys.modules, "loky", None)
     with pytest.raises(ImportError, match=r"pip install 'jast\[blackbox\]'"):
-        Pool(b"", 1, None)._start([pool.Worker(b"")])
+        Pool(b"", 1, None)._start([Worker(b"")])
 
 
 def test_a_system_that_no_worker_can_load_ends_the_search(tmp_path, monkeypatch):

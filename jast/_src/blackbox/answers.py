@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jast._src.blackbox.worker import Reply, history
+from jast._src.blackbox.rows import Reply, history
 
 __all__ = ["Answer", "Answers", "answer_of", "keys_of", "part_of"]
 

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from jast._src.blackbox.answers import Answers, answer_of, keys_of, part_of
-from jast._src.blackbox.worker import fill
+from jast._src.blackbox.rows import fill
 from jast._src.runtime.host_errors import Log
 
 __all__ = ["Calls", "Host"]

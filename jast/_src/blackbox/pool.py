@@ -1,148 +1,27 @@
-"""Worker processes that run a system: one loky executor of one process each, so that the death or
-hang of one leaves the others alone.
-"""
+"""Worker processes that run a system: the death or hang of one leaves the others alone."""
 
-import contextlib
-import io
-import os
-import pickle
-import pkgutil
 import re
-import tempfile
 import time
 import weakref
 from collections import deque
 from concurrent.futures import FIRST_COMPLETED, wait
-from functools import partial
 from multiprocessing.util import Finalize
 from typing import NamedTuple
 
 import numpy as np
 
-from jast._src.blackbox import environment, programs, worker
-from jast._src.util.checks import import_library
+from jast._src.blackbox.rows import FAILED, Reply, blank
+from jast._src.blackbox.worker_process import AGAIN, JUDGE, PROBE, START, Worker
 
-__all__ = ["Pool", "pack"]
+__all__ = ["Pool"]
 
-NEEDS = "jast.blackbox with workers >= 1"
 GRACE = 1.0  # seconds that a worker has beyond the time limit of what it runs before it is killed
-START = 60.0  # seconds that a worker may take to start, and to load the system
 TRIES = 3  # at a piece that a worker does not begin, until its first row is at fault
 PIECE = 0.01  # seconds of work in a piece, at least, where that leaves no worker idle
 
 
 class Unloadable(RuntimeError):
     """A worker process cannot load the system: nothing can be run."""
-
-
-class _Remote:
-    """A function of the module that a worker keeps its system in, by name."""
-
-    def __init__(self, name):
-        self.name = name
-
-    def __reduce__(self):
-        return pkgutil.resolve_name, (f"{worker.NAME}:{self.name}",)
-
-    def __call__(self, *args):
-        raise RuntimeError("only a worker has this function")
-
-
-class _Install:
-    """Unpickled in a worker, it is there."""
-
-    def __init__(self, system, spec):
-        self.parts = system, spec
-
-    def __reduce__(self):
-        return worker.install, self.parts
-
-
-SERVE, PROBE, CONFIGURE, JUDGE, AGAIN = map(
-    _Remote, ("serve", "probe", "configure", "judge", "again")
-)
-
-
-def pack(system, spec):
-    """The system as bytes; this package's part of them by value, so that a worker need not import
-    it. Raises ValueError for one that cannot be sent.
-    """
-    cloudpickle = import_library(NEEDS, "cloudpickle", "blackbox")
-    registered = cloudpickle.list_registry_pickle_by_value()
-    own = [m for m in (worker, programs, environment) if m.__name__ not in registered]
-    for module in own:
-        cloudpickle.register_pickle_by_value(module)
-    try:
-        return cloudpickle.dumps(_Install(system, spec))
-    except Exception as error:
-        raise ValueError(
-            f"from_python: system cannot be sent to a worker process: {type(error).__name__}:"
-            f" {error}; define it at the top of a module, and open files, locks and connections"
-            " inside of it, not around it"
-        ) from error
-    finally:
-        for module in own:
-            cloudpickle.unregister_pickle_by_value(module)
-
-
-class Worker:
-    """One process, started on first use and started anew after its end."""
-
-    def __init__(self, payload):
-        self.payload, self.executor, self.at, self.file = payload, None, None, None
-        self.unbegun = 0  # pieces that it was given and lost before it began any, in a row
-
-    def start(self):
-        """A future that is done when the process has the system."""
-        if self.executor is None:
-            loky = import_library(NEEDS, "loky", "blackbox")
-            self.executor = loky.ProcessPoolExecutor(max_workers=1, timeout=None)
-            return self.executor.submit(pickle.loads, self.payload)
-
-    def configure(self, x, size):
-        """It is to say in a file when what it runs began, and what each row came to."""
-        if self.file is not None:
-            self.executor.submit(CONFIGURE, x, size)
-            return
-        self.file = tempfile.NamedTemporaryFile(prefix="jast-", buffering=0, delete=False)
-        self.file.write(bytes(worker.HEAD) + worker.END)
-        self.at = np.memmap(self.file, np.float64, "r+", shape=2)
-        self.executor.submit(CONFIGURE, x, size, self.file.name).result(timeout=START)
-        self._forget_file()  # both have it open
-
-    def serve(self, *rows):
-        """A future of the answers of rows, of which the file says nothing yet."""
-        self.at[:] = 0.0, -1.0
-        self.file.seek(worker.HEAD)
-        self.file.write(worker.END)
-        return self.executor.submit(SERVE, *rows)
-
-    def finished(self):
-        """(place, outcome, problems, episodes, transitions so far) of each row that it has finished
-        of what it was given last.
-        """
-        self.file.seek(worker.HEAD)
-        written, found = io.BytesIO(self.file.read()), []
-        with contextlib.suppress(Exception):  # the last one may be torn
-            for row in iter(partial(pickle.load, written), None):
-                if row[0] != len(found):
-                    break
-                found.append(row)
-        return found
-
-    def kill(self):
-        executor, self.executor = self.executor, None
-        if executor is not None:
-            executor.shutdown(wait=False, kill_workers=True)
-        if self.file is not None:
-            self.at = None
-            self.file.close()
-            self._forget_file()
-            self.file = None
-
-    def _forget_file(self):
-        with contextlib.suppress(OSError):  # Windows lets no mapped file go, until its end
-            os.unlink(self.file.name)
 
 
 def _close(workers):
@@ -224,11 +103,11 @@ class Pool:
             _failure(error)
 
     def __call__(self, t, x0, xs, lanes):
-        """As `worker.Runner`: the `worker.Reply` for n rows; ``lanes`` [n]: their places in the
+        """As `worker.Runner`: the `Reply` for n rows; ``lanes`` [n]: their places in the
         batch, which a search keeps from step to step.
         """
         n = len(t)
-        reply = worker.Reply(*worker.blank(n, self.size), problems=[])
+        reply = Reply(*blank(n, self.size), problems=[])
         queues = self._pieces(lanes)
         free, busy = set(self.workers), {}
         try:
@@ -266,7 +145,7 @@ class Pool:
                     problem = "timed out", f"no answer within {limit}, and could not be interrupted"
                     if task in done:
                         try:
-                            reply = _merge(reply, piece.rows, worker.Reply(*task.result()))
+                            reply = _merge(reply, piece.rows, Reply(*task.result()))
                             piece.worker.unbegun = 0
                             continue
                         except Exception as error:
@@ -296,7 +175,7 @@ class Pool:
         counts = finished[-1][-2:] if finished else (0, 0)
         if row not in places:  # else it ended the process when it had its answer
             places.append(row)
-            _put(reply, int(piece.rows[row]), worker.FAILED, [problem])
+            _put(reply, int(piece.rows[row]), FAILED, [problem])
             counts = counts[0] + self.spec.episodic, counts[1]
         if len(left := np.delete(piece.rows, places)):
             piece.queue.appendleft(left)

@@ -16,7 +16,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jast._src.blackbox.worker import NAME, WrongAnswer, end_group
+from jast._src.blackbox.readings import WrongAnswer
+from jast._src.blackbox.worker import NAME, end_group
 from jast._src.core.typing import PathLike
 from jast._src.util.checks import wrong
 

@@ -1,5 +1,5 @@
-"""from_python: a system that is not written in JAX as a `jast.Simulator`. Its state is the record
-of its disturbances; only an outcome asks the host.
+"""from_python: a system that is not written in JAX as a `jast.Simulator`, whose `states` are
+records of its disturbances.
 """
 
 from __future__ import annotations
@@ -7,90 +7,31 @@ from __future__ import annotations
 import inspect
 from collections.abc import Callable
 from functools import partial
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from jast import distributions as D
+from jast._src.blackbox import states
 from jast._src.blackbox.host_calls import Calls, Host
-from jast._src.blackbox.pool import Pool, pack
-from jast._src.blackbox.worker import METHODS, Runner, Spec, takes
+from jast._src.blackbox.pool import Pool
+from jast._src.blackbox.rows import Spec
+from jast._src.blackbox.worker import METHODS, Runner, takes
+from jast._src.blackbox.worker_process import pack
 from jast._src.core.contract import OBSERVED
 from jast._src.core.simulator import Simulator, fixed, translating
 from jast._src.core.typing import Array, ArrayTree, DistributionLike, Disturbance, Start
 from jast._src.distributions.containers import accepted
 from jast._src.distributions.special import Seeds
-from jast._src.runtime._jax import host_call
 from jast._src.runtime.host_errors import Asking, hosts_of
 from jast._src.util.checks import number, whole_number, wrong
-from jast._src.util.pytrees import select, shapes_text
+from jast._src.util.pytrees import shapes_text
 
-__all__ = ["Record", "Standing", "calls", "from_python"]
+__all__ = ["calls", "from_python"]
 
 NAME = "from_python"
-
-
-class Record(NamedTuple):
-    """State of an episodic black box.
-
-    Example:
-        >>> import jax.numpy as jnp, jast
-        >>> from jast import distributions as D
-        >>> run = lambda x: (bool(x.sum() > 5.0), float(max(5.0 - x.sum(), 0.0)))
-        >>> sim = jast.blackbox.from_python(run, horizon=10, disturbance=D.Normal(0.0, 1.0))
-        >>> state = sim.step(sim.init(()), jnp.array(2.0))
-        >>> int(state.t), state.disturbances[:2].tolist()
-        (1, [2.0, 0.0])
-    """
-
-    begun: Array
-    """bool: True in every state of an episode; the system is not run on a state of zeros."""
-    t: Array
-    """int32: disturbances so far."""
-    x0: ArrayTree
-    disturbances: ArrayTree
-    """[horizon, ...]: the first t rows; zeros after them."""
-
-
-class Standing(NamedTuple):
-    """State of a black box that is looked at after every disturbance.
-
-    Example:
-        >>> import jax.numpy as jnp, jast
-        >>> from jast import distributions as D
-        >>> class Tank:
-        ...     def initialize(self):
-        ...         self.level = 5.0
-        ...
-        ...     def transition(self, x):
-        ...         self.level += float(x)
-        ...
-        ...     def miss_distance(self):
-        ...         return max(self.level, 0.0)
-        ...
-        ...     def is_event(self):
-        ...         return self.level <= 0.0
-        >>> sim = jast.blackbox.from_python(Tank, horizon=10, disturbance=D.Normal(0.0, 1.0))
-        >>> float(jast.replay(sim, jnp.array([-2.0, 1.0])).states.distance[1])  # after one step
-        3.0
-    """
-
-    begun: Array
-    t: Array
-    x0: ArrayTree
-    disturbances: ArrayTree
-    event: Array
-    """bool."""
-    distance: Array
-    """float: miss distance; NaN where something went wrong."""
-    terminal: Array
-    """bool: ended without a failure, or by an incident."""
-    log_p: Array
-    """float: log p of the last disturbance as the object says it; 0 where it says nothing."""
-    seen: Array
-    """[k] float: what the object's ``observe`` returned; empty where it has none."""
 
 
 def from_python(
@@ -240,7 +181,7 @@ def from_python(
     if not (constant or callable(disturbance)):
         must = "be a distribution, or a function state -> distribution"
         raise wrong(NAME, "disturbance", must, f"{disturbance!r}")
-    blank = partial(_blank, episodic, horizon, like0, size)
+    blank = partial(states.blank, episodic, horizon, like0, size)
     like = D.event_like(disturbance) if constant else _shape(disturbance, blank, like)
     runner.configure(_structure("disturbance", like), size)
     host = Host(runner, len(jax.tree.leaves(like0)))
@@ -253,15 +194,15 @@ def from_python(
         horizon=horizon,
         start=start,
         episodic=episodic,
-        observe=_observe if observe is None else observe,
+        observe=states.observe if observe is None else observe,
     )
     if episodic:
-        judge = _judge if tells is None else _judge_with_log_p
-        return Simulator(begin, _extend, evaluate=Asking(host, judge), **fields)
+        judge = states.judge if tells is None else states.judge_with_log_p
+        return Simulator(begin, states.extend, evaluate=Asking(host, judge), **fields)
     return Simulator(
-        lambda x0: _with_outcome(host, begin(x0)),
-        Asking(host, _transition),
-        evaluate=_outcome if tells is None else _outcome_and_log_p,
+        lambda x0: states.with_outcome(host, begin(x0)),
+        Asking(host, states.transition),
+        evaluate=states.outcome if tells is None else states.outcome_and_log_p,
         is_terminal=lambda state: state.terminal,
         **fields,
     )
@@ -293,102 +234,6 @@ def calls(sim: Simulator) -> Calls:
         must = "be a simulator of jast.blackbox.from_python"
         raise wrong("calls", "sim", must, "one that runs nothing on the host")
     return Calls(*map(sum, zip(*counts)))
-
-
-def _judge(host, state):
-    """Event and distance of an episode; NaN before its end. A state of zeros is not asked for."""
-    return _judge_with_log_p(host, state)[:2]
-
-
-def _judge_with_log_p(host, state):
-    """`_judge`, and log p as the system says it."""
-    live = state.begun & (state.t == host.spec.horizon)
-    event, distance, _, log_p, _ = _ask(host, 0, live, state.t, state.x0, state.disturbances)
-    return event, jnp.where(live | ~state.begun, distance, jnp.nan), log_p
-
-
-def _extend(state, x):
-    rows = jax.tree.map(
-        lambda a, v: a.at[state.t].set(jnp.asarray(v, a.dtype)), state.disturbances, x
-    )
-    return state._replace(t=state.t + 1, disturbances=rows)
-
-
-def _transition(host, state, x):
-    """An ended state, and one of zeros, stays as it is and is not asked for."""
-    over = ~state.begun | state.event | state.terminal | (state.t >= host.spec.horizon)
-    after = _with_outcome(host, _extend(state, x), ~over)
-    return select(over, state, after)
-
-
-def _with_outcome(host, state, live=True):
-    """``state`` with its outcome."""
-    size, live = state.seen.shape[0], state.begun & live
-    found = _ask(host, size, live, state.t, state.x0, state.disturbances)
-    return Standing(*state[: -len(found)], *found)
-
-
-def _outcome(state):
-    return state.event, state.distance
-
-
-def _outcome_and_log_p(state):
-    return state.event, state.distance, state.log_p
-
-
-def _observe(state):
-    if isinstance(state, Standing) and state.seen.shape[0]:
-        return state.seen
-    rows = jax.tree.leaves(state.disturbances)
-    dtype = jnp.zeros(()).dtype
-
-    def numbers(a):
-        a = jnp.ravel(a[jnp.maximum(state.t - 1, 0)])
-        # a seed is an unsigned number of any size
-        seed = jnp.issubdtype(a.dtype, jnp.unsignedinteger)
-        return a.astype(dtype) / (float(jnp.iinfo(a.dtype).max) if seed else 1.0)
-
-    last = map(numbers, rows)
-    return jnp.concatenate([(state.t / rows[0].shape[0]).astype(dtype)[None], *last])[:OBSERVED]
-
-
-@partial(jax.custom_jvp, nondiff_argnums=(0, 1))
-def _ask(host, size, live, t, x0, disturbances):
-    """Event, distance, terminal, log p and [size] observed numbers from the host, where ``live``;
-    one call for a batch, under any number of `jax.vmap`.
-    """
-    flag, number = (jax.ShapeDtypeStruct((), d) for d in (bool, jnp.zeros(()).dtype))
-    shapes = flag, number, flag, number, jax.ShapeDtypeStruct((size,), number.dtype)
-    return host_call(
-        host.callback(number.dtype, size), shapes, live, t, *jax.tree.leaves((x0, disturbances))
-    )
-
-
-@_ask.defjvp
-def _(host, size, primals, tangents):
-    """No gradient: NaN, whatever the direction."""
-    event, distance, terminal, log_p, seen = _ask(host, size, *primals)
-    floats = [a for a in jax.tree.leaves(tangents) if a.dtype != jax.dtypes.float0]
-    moved = [jnp.sum(a).astype(distance.dtype) for a in floats]
-    unknown = sum(moved, jnp.zeros_like(distance)) * jnp.nan
-    none = np.zeros((), jax.dtypes.float0)
-    slopes = none, unknown, none, unknown, jnp.broadcast_to(unknown, seen.shape)
-    return (event, distance, terminal, log_p, seen), slopes
-
-
-def _blank(episodic, horizon, like0, size, like):
-    """A state of zeros; ``like0``, ``like``: shapes and dtypes of x0 and x."""
-    no, zero = jnp.zeros((), bool), jnp.zeros(())
-    record = Record(
-        begun=no,
-        t=jnp.zeros((), jnp.int32),
-        x0=jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), like0),
-        disturbances=jax.tree.map(lambda s: jnp.zeros((horizon, *s.shape), s.dtype), like),
-    )
-    if episodic:
-        return record
-    seen = jnp.zeros((size,))
-    return Standing(*record, event=no, distance=zero, terminal=no, log_p=zero, seen=seen)
 
 
 def _shape(disturbance, blank, like):

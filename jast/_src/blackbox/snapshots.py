@@ -10,7 +10,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jast._src.blackbox.worker import Runner, fill, said
+from jast._src.blackbox.readings import said
+from jast._src.blackbox.rows import fill
+from jast._src.blackbox.worker import Runner
 
 __all__ = ["BranchingRunner", "Look", "Saved"]
 

@@ -1,8 +1,8 @@
 """Runs a system, in this process or in a worker's: a row is an episode, or one transition of an
 object that is kept.
 
-This module goes to the workers by value, so that they need neither JAX nor this package: it imports
-NumPy and the standard library only.
+This room goes to the workers by value, so that they need neither JAX nor this package: what a
+`Runner` is made of imports NumPy and the standard library only.
 """
 
 import contextlib
@@ -13,124 +13,30 @@ import signal
 import sys
 import threading
 import time
-import traceback
 import types
 from collections import deque
-from typing import NamedTuple
 
 import numpy as np
 
-__all__ = [
-    "END",
-    "METHODS",
-    "FAILED",
-    "HEAD",
-    "NAME",
-    "Reply",
-    "Runner",
-    "Spec",
-    "WrongAnswer",
-    "blank",
-    "end_group",
-    "fill",
-    "history",
-    "install",
-    "line_of",
-    "said",
-    "takes",
-]
+from jast._src.blackbox.readings import (
+    WrongAnswer,
+    distance_of,
+    event_of,
+    log_p_of,
+    observed_of,
+    said,
+    shown,
+)
+from jast._src.blackbox.rows import FAILED, Reply, blank, fill, history
+from jast._src.blackbox.time_limit import Alarm
+
+__all__ = ["END", "HEAD", "METHODS", "NAME", "Runner", "end_group", "install", "takes"]
 
 METHODS = ("initialize", "transition", "miss_distance", "is_event")
 KEPT = 8192  # objects that are kept at most for the next transitions of their episodes
 NAME = "jast_blackbox_worker"  # the module that a worker process keeps its system in
-
-
-class WrongAnswer(Exception):
-    """The system answered something else than what was asked."""
-
-    kind = "wrong answer"
-
-
-class NotANumber(Exception):
-    """The system answered NaN or infinity."""
-
-    kind = "NaN"
-
-
-class TimedOut(BaseException):
-    """Not an Exception, so that the system's own ``except Exception`` does not stop it."""
-
-    kind = "timed out"
-
-
-class Spec(NamedTuple):
-    """What a `Runner` knows beside the system."""
-
-    run: bool
-    """The system is a function of whole episodes, not a class"""
-    episodic: bool
-    horizon: int
-    x0: object
-    """The structure of x0, with the place of each leaf"""
-    random: bool
-    """x0 is given to the system"""
-    limit: float | None
-    """Seconds"""
-    tells: str | None = None
-    """What the system says of the probability of its disturbances: "log_prob" or "prob"; "maybe",
-    log p where it says a number; None: nothing that counts
-    """
-
-
-class Reply(NamedTuple):
-    """The outcome of n rows."""
-
-    event: np.ndarray
-    """[n] bool"""
-    distance: np.ndarray
-    """[n] float64; NaN where something went wrong"""
-    terminal: np.ndarray
-    """[n] bool"""
-    log_p: np.ndarray
-    """[n] float64: what the system said of the last disturbance; of the whole episode where
-    episodic; 0 where it said nothing
-    """
-    seen: np.ndarray
-    """[n, k] float64: what ``observe`` returned"""
-    problems: list
-    """(row, kind, message)"""
-    episodes: int = 0
-    """Starts of the system"""
-    transitions: int = 0
-    seconds: float = 0.0
-
-
-def fill(structure, leaves):
-    """The tree of ``structure``, whose leaves are places in ``leaves``."""
-    if isinstance(structure, dict):
-        return {k: fill(v, leaves) for k, v in structure.items()}
-    if isinstance(structure, tuple | list):
-        parts = [fill(v, leaves) for v in structure]
-        return type(structure)(*parts) if hasattr(structure, "_fields") else type(structure)(parts)
-    return None if structure is None else leaves[structure]
-
-
-def takes(function, count):
-    """Whether ``function`` can be called with so many arguments; True where Python does not
-    know.
-    """
-    try:
-        inspect.signature(function).bind(*[None] * count)
-    except TypeError:
-        return False
-    except ValueError:
-        pass
-    return True
-
-
 HEAD = 16  # bytes of a worker's file before its finished rows: when what runs began, and its row
 END = pickle.dumps(None)  # behind these rows
-FAILED = (False, np.nan, True, 0.0, 0.0)  # event, distance, terminal, log p and what is seen
 MAKING = 60.0  # seconds that the making of an object may take, whatever the time limit of its runs
 
 
@@ -182,7 +88,7 @@ class Runner:
             if not self.spec.episodic and callable(getattr(thing, "observe", None)):
                 with self.alarm:
                     self._initialize(thing, x0)
-                    size = len(_observed(thing.observe(), None))
+                    size = len(observed_of(thing.observe(), None))
             self.spare.append(thing)
         except KeyboardInterrupt:
             raise
@@ -238,11 +144,11 @@ class Runner:
                 thing = self._fresh()
                 with self.alarm:
                     self._initialize(thing, [np.array(a[i]) for a in x0])
-                    events = [_event(thing.is_event())]
+                    events = [event_of(thing.is_event())]
                     for k in range(self.spec.horizon):
                         thing.transition(fill(self.x, [np.array(a[i, k]) for a in xs]))
                         _evaluate(thing)
-                        events.append(_event(thing.is_event()))
+                        events.append(event_of(thing.is_event()))
             except KeyboardInterrupt:
                 raise
             except BaseException:
@@ -301,9 +207,9 @@ class Runner:
             told = self.spec.tells in ("log_prob", "prob")
             if not isinstance(answer, tuple | list) or len(answer) != 2 + told:
                 expected = ("the pair (event, distance)", "(p, event, distance)")[told]
-                raise WrongAnswer(f"expected {expected}, received {_show(answer)}")
-            log_p = self._log_p(answer[0], "p") if told else 0.0
-            return _event(answer[-2]), _distance(answer[-1]), False, log_p, ()
+                raise WrongAnswer(f"expected {expected}, received {shown(answer)}")
+            log_p = log_p_of(answer[0], "p", self.spec.tells) if told else 0.0
+            return event_of(answer[-2]), distance_of(answer[-1]), False, log_p, ()
         thing = self._fresh()
         found = self._play(thing, t, x0, xs)
         self.spare.append(thing)
@@ -354,8 +260,8 @@ class Runner:
         """Event, distance, terminal, log p and observation of an object at its state."""
         with self.alarm:
             log_p, *outcome = self._outcome(thing, log_p, answer)
-            ended = hasattr(thing, "is_terminal") and _event(thing.is_terminal(), "is_terminal")
-            observed = _observed(thing.observe(), self.size) if self.size else ()
+            ended = hasattr(thing, "is_terminal") and event_of(thing.is_terminal(), "is_terminal")
+            observed = observed_of(thing.observe(), self.size) if self.size else ()
         return *outcome, ended, log_p, observed
 
     def _initialize(self, thing, x0):
@@ -365,30 +271,16 @@ class Runner:
     def _transition(self, thing, x):
         """log p of one disturbance, by what ``transition`` returns."""
         self.transitions += 1
-        return self._log_p(thing.transition(x), "transition")
+        return log_p_of(thing.transition(x), "transition", self.spec.tells)
 
     def _outcome(self, thing, log_p, answer):
         """log p, event and distance; ``answer``: what ``evaluate`` returned, whose (p, event,
         distance) stand in place of the others.
         """
         if isinstance(answer, tuple | list) and len(answer) == 3:
-            return self._log_p(answer[0], "evaluate"), _event(answer[1]), _distance(answer[2])
-        return log_p, _event(thing.is_event()), _distance(thing.miss_distance())
-
-    def _log_p(self, value, name):
-        tells = self.spec.tells
-        if tells is None:
-            return 0.0
-        a = _array(value)
-        if a.shape != () or a.dtype.kind not in "fiu":
-            if tells == "maybe":
-                return 0.0
-            expected = "log p" if tells == "log_prob" else "p"
-            raise WrongAnswer(f"{name} must give {expected}, one number, received {_show(value)}")
-        if np.isnan(a) or a == np.inf or (tells == "prob" and a < 0):
-            raise NotANumber(f"{name} gives {a} as {'p' if tells == 'prob' else 'log p'}")
-        with np.errstate(divide="ignore"):
-            return float(np.log(a) if tells == "prob" else a)
+            log_p = log_p_of(answer[0], "evaluate", self.spec.tells)
+            return log_p, event_of(answer[1]), distance_of(answer[2])
+        return log_p, event_of(thing.is_event()), distance_of(thing.miss_distance())
 
     def _given(self, x0):
         return (fill(self.spec.x0, x0),) if self.spec.random else ()
@@ -411,117 +303,21 @@ class Runner:
         return thing
 
 
-class Alarm(contextlib.AbstractContextManager):
-    """Raises `TimedOut` in what runs for longer than ``seconds``, where signals exist and the code
-    can be interrupted; None: never. The file ``at``, if there is one, is told when what runs began,
-    and the row that it is of.
-    """
-
-    def __init__(self, seconds):
-        self.at, self.row = None, 0
-        self.seconds = seconds if seconds is not None and hasattr(signal, "setitimer") else None
-        self.on = self.rang = False
-
-    def tell(self, later=0.0):
-        """What runs now may take its time limit from then on."""
-        if self.at is not None:
-            self.at[:] = time.monotonic() + later, self.row
-
-    def __enter__(self):
-        self.tell()
-        if self.seconds is not None:
-            signal.signal(signal.SIGALRM, self._ring)
-            self.on, self.rang = True, False
-            signal.setitimer(signal.ITIMER_REAL, self.seconds, self.seconds)
-
-    def __exit__(self, *error):
-        self.on = False  # first: a signal that is already on its way no longer raises
-        if self.seconds is not None:
-            signal.setitimer(signal.ITIMER_REAL, 0)
-            if self.rang:  # even where the system caught it
-                raise TimedOut(f"no answer within {self.seconds:g} s") from None
-
-    def _ring(self, *_):
-        if self.on:
-            self.rang = True
-            raise TimedOut
-
-
-def history(x0, xs, t):
-    """What tells episodes of ``t`` disturbances apart."""
-    return t, *(a.tobytes() for a in x0), *(a[:t].tobytes() for a in xs)
-
-
-def blank(n, size):
-    """Event, distance, terminal, log p and observation of n rows that have no answer yet."""
-    no = np.zeros(n, bool)
-    return no, np.full(n, np.nan), no.copy(), np.zeros(n), np.zeros((n, size))
-
-
 def _evaluate(thing):
     return thing.evaluate() if hasattr(thing, "evaluate") else None
 
 
-def _event(value, name="event"):
-    a = _array(value)
-    if a.shape == () and a.dtype.kind == "f" and not np.isfinite(a):
-        raise NotANumber(f"{name} is {a}")
-    if a.size != 1 or a.dtype.kind not in "biu" or int(a.item()) not in (0, 1):
-        raise WrongAnswer(f"{name} must be True or False, received {_show(value)}")
-    return bool(a.item())  # of 0 and 1, too, and of one in an array
-
-
-def _distance(value):
-    a = _array(value)
-    if a.shape != () or a.dtype.kind not in "fiu":
-        raise WrongAnswer(f"distance must be one number, received {_show(value)}")
-    if not np.isfinite(a):
-        raise NotANumber(f"distance is {a}")
-    return float(a)
-
-
-def _observed(value, size):
-    a = _array(value)
-    if a.ndim != 1 or a.dtype.kind not in "fiub" or (size is not None and len(a) != size):
-        raise WrongAnswer(
-            f"observe must return a vector of {'' if size is None else f'{size} '}numbers, received"
-            f" {_show(value)}"
-        )
-    return a
-
-
-def _array(value):
+def takes(function, count):
+    """Whether ``function`` can be called with so many arguments; True where Python does not
+    know.
+    """
     try:
-        return np.asarray(value)
-    except ValueError:  # rows of different lengths
-        return np.array(None)
-
-
-def _show(value):
-    text = " ".join(repr(value).split())
-    return text if len(text) <= 80 else f"{type(value).__name__} {text[:70]} ..."
-
-
-def said(error):
-    """(kind, message) of what the system raised."""
-    if isinstance(error, TimedOut | WrongAnswer | NotANumber):
-        return error.kind, str(error)
-    try:
-        text = " ".join(str(error).split())[:200]
-    except Exception:  # the system's own exception cannot say what it is
-        text = ""
-    return "raised", f"raised {type(error).__name__}{f': {text}' if text else ''}{line_of(error)}"
-
-
-def line_of(error):
-    """ " (system.py:12)": the last line of the system's own code that ``error`` went through."""
-    here = os.path.join(os.path.dirname(os.path.dirname(os.path.dirname(__file__))), "")
-    frames = traceback.extract_tb(error.__traceback__)
-    frames = [f for f in frames if not f.filename.startswith(here)]
-    libraries = os.path.dirname(os.__file__), "<frozen"
-    own = [f for f in frames if "site-packages" not in f.filename]
-    own = [f for f in own if not f.filename.startswith(libraries)] or frames
-    return f" ({os.path.basename(own[-1].filename)}:{own[-1].lineno})" if own else ""
+        inspect.signature(function).bind(*[None] * count)
+    except TypeError:
+        return False
+    except ValueError:
+        pass
+    return True
 
 
 def install(system, spec):

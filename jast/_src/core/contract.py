@@ -125,7 +125,7 @@ def called(name, function, *args):
     try:
         found = function(*given)
     except Exception as e:
-        from jast._src.blackbox.worker import line_of
+        from jast._src.blackbox.readings import line_of
 
         kind = type(e).__name__
         hint = HINTS.get(kind, NO_START if name == "init" and args == ((),) else "")

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from jast._src.blackbox.simulator import Record, Standing
+from jast._src.blackbox.states import Record, Standing
 from jast._src.core.episode import Episode, replay, rollout, stacked
 from jast._src.core.failures import Failures
 from jast._src.core.policy import undisturbed
