@@ -34,7 +34,7 @@ RECORDS = {
     "Mode": "jast._src.search.refine.modes:Mode",
     "Modes": "jast._src.search.refine.modes:Modes",
     "Sweep": "jast._src.sweeping.table:Sweep",
-    "Crossing": "jast._src.sweeping.table:Crossing",
+    "Crossing": "jast._src.sweeping.crossing:Crossing",
     "Roots": "jast._src.search.tree.prune:Roots",
     "Branches": "jast._src.search.tree.edges:Branches",
     "Heads": "jast._src.heads.heads:Heads",

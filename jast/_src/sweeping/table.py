@@ -1,6 +1,4 @@
-"""What `jast.sweep` returns: one row for each value, as a table and as a picture, and where a
-probability crosses a level.
-"""
+"""What `jast.sweep` returns: one row for each value, as a table and as a picture."""
 
 from __future__ import annotations
 
@@ -13,6 +11,7 @@ import numpy as np
 from jast._src.core.nominal import Nominal
 from jast._src.estimate.estimate import guaranteed_words, is_doubtful
 from jast._src.io.data_frames import dataframe
+from jast._src.sweeping.crossing import Crossing, crossing
 from jast._src.util import display
 from jast._src.util.checks import wrong
 from jast._src.util.intervals import checked_level
@@ -20,7 +19,7 @@ from jast.estimate import Estimate
 from jast.search import SearchResult
 from jast.stress_testing import Report
 
-__all__ = ["Answer", "Crossing", "Sweep", "answer"]
+__all__ = ["Answer", "Sweep", "answer"]
 
 NOTE = "note"  # the name of a table's last column
 CELL = 60  # characters of a cell at most
@@ -33,35 +32,6 @@ class Answer(NamedTuple):
     low: float = math.nan
     high: float = math.nan
     reliable: bool = False
-
-
-class Crossing(NamedTuple):
-    """Where the probability of failure crosses ``level``.
-
-    Example:
-        >>> import jax, jast
-        >>> make = lambda threshold: jast.simulators.walk1d(threshold=threshold)
-        >>> table = jast.sweep(
-        ...     jax.random.key(0), make, {"threshold": [8.0, 12.0]}, jast.nominal, episodes=500
-        ... )
-        >>> crossing = table.crossing(0.1)
-        >>> crossing.interval[0] < crossing.value < crossing.interval[1]
-        True
-    """
-
-    name: str
-    """Of the setting."""
-    value: float
-    """By interpolation of the normal scores of probabilities."""
-    interval: tuple[float, float]
-    """Where the intervals of the rows, interpolated in several ways, hold ``level``
-    (`Sweep.crossing`); infinite where they still do at the last value of the sweep
-    """
-    level: float
-
-    def __str__(self) -> str:
-        low, high = self.interval
-        return f"{self.name} {self.value:.6g} [{low:.6g}, {high:.6g}] at probability {self.level:g}"
 
 
 @display.result_class("episodes")
@@ -158,31 +128,8 @@ class Sweep(NamedTuple):
         """
         level = checked_level("crossing", level)
         name, x = self.axis("crossing", against)
-        p, (low, high) = self.probability, self.interval.T
-        used = np.isfinite(x) & (p > 0) & (self.reliable | unreliable)
-        rows = np.flatnonzero(used)[np.argsort(x[used], kind="stable")]
-        if len(rows) < 2:
-            raise ValueError(
-                "crossing: expected at least two rows with a reliable probability, received"
-                f" {len(rows)} of {len(x)}; unreliable=True also uses the others"
-            )
-        x, bands = x[rows], [a[rows] for a in (p, low, high)]
-        scores = _score(bands[0]) - _score(level)
-        if not (at := _zeros(x, scores)):
-            raise ValueError(
-                f"crossing: the probability does not cross {level:g}: for {name} from {x[0]:.6g}"
-                f" to {x[-1]:.6g} it lies between {p[rows].min():.3g} and {p[rows].max():.3g}"
-            )
-        (left, right), wider = (_zone(x, bands, level, f) for f in (_score, np.log))
-        left, right = min(left, wider[0]), max(right, wider[1])
-        if at[-1] > right:
-            places = ", ".join(f"{v:.6g}" for v in at)
-            raise ValueError(
-                f"crossing: the probability crosses {level:g} at several values of {name}: {places}"
-            )
-        bends = _bends(x, scores)
-        interval = min([left, *bends]), max([right, *bends])
-        return Crossing(name, (at[0] + at[-1]) / 2, interval, level)
+        rows = np.column_stack([self.probability, self.interval])
+        return crossing(name, x, rows, self.reliable | unreliable, level)
 
     def to_dataframe(self) -> Any:
         """The table as one of pandas (the extra ``tables``), a row for each system: the settings,
@@ -311,49 +258,6 @@ def _first_warning(result):
     """The first reason not to believe a result."""
     reasons = getattr(_estimate_of(result), "warnings", ())
     return shorten(": ".join(["UNRELIABLE", *reasons[:1]]), CELL, placeholder=" ...")
-
-
-def _score(p):
-    """The normal score of p, rising; of 1 as of the greatest float below it, to be finite."""
-    from scipy.special import ndtri  # here: slow to import
-
-    return ndtri(np.minimum(p, 1 - 2.0**-53))
-
-
-def _zone(x, bands, level, scale):
-    """The nearest places on both sides of where p crosses ``level``, at which an end of its
-    interval does, by straight lines of ``scale(p)``; ``bands``: p and the ends of its intervals.
-    """
-    with np.errstate(divide="ignore"):
-        at, *ends = (_zeros(x, scale(a) - scale(level)) for a in bands)
-    ends = [*ends[0], *ends[1]]
-    left = max((e for e in ends if e <= at[0]), default=-math.inf)
-    return left, min((e for e in ends if e >= at[0]), default=math.inf)
-
-
-def _bends(x, y):
-    """Where the line through (x, y) is 0 if it goes on between two points, one above 0 and one
-    below, as it came to either of them; at the other one where it does not come to 0 before.
-    """
-    out = []
-    for i in np.flatnonzero((y[1:] < 0) != (y[:-1] < 0)):
-        for before, near, far in ((i - 1, i, i + 1), (i + 2, i + 1, i)):
-            if 0 <= before < len(x) and x[before] != x[near]:
-                gap = x[far] - x[near]
-                rise = (y[near] - y[before]) / (x[near] - x[before]) * gap
-                share = min(-y[near] / rise, 1) if y[near] * rise < 0 else y[near] != 0
-                out.append(float(x[near] + share * gap))
-    return out
-
-
-def _zeros(x, y):
-    """Where the line through (x, y) is 0, x rising; from a y of -inf on, at the finite end."""
-    out = []
-    for x0, x1, a, b in zip(x, x[1:], y, y[1:]):
-        if (a < 0) != (b < 0):
-            share = 1.0 if a == -math.inf else 0.0 if b == -math.inf else a / (a - b)
-            out.append(float(x0 + share * (x1 - x0)))
-    return out
 
 
 def _number(value):
