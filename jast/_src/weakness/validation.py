@@ -137,15 +137,15 @@ def _begin(key, data, selector):
         numbers = numpy_generator(key).integers(0, 2**32, 2, np.uint32)
     memory = selector.start(iteration_key(numbers, 0), data)
     return State(
-        _described(selector),
-        fingerprint(data),
-        numbers,
-        memory,
-        np.zeros(0, int),
-        np.full(n, -1, np.int32),
-        0,
-        history,
-        False,
+        selector=_described(selector),
+        data=fingerprint(data),
+        key=numbers,
+        memory=memory,
+        order=np.zeros(0, int),
+        predicted=np.full(n, -1, np.int32),
+        complete=0,
+        history=history,
+        finished=False,
     )
 
 
@@ -337,14 +337,14 @@ def _result(state, data, incidents):
         float(h.expected[-1]) if len(h.expected) and state.complete == len(state.order) else np.nan
     )
     return Result(
-        failures,
-        len(state.order),
-        state.order,
-        state.predicted,
-        scores,
-        ranked,
-        expected,
-        h,
-        incidents,
-        state,
+        failures=failures,
+        calls=len(state.order),
+        order=state.order,
+        predicted=state.predicted,
+        scores=scores,
+        ranked=ranked,
+        expected=expected,
+        history=h,
+        incidents=incidents,
+        state=state,
     )
