@@ -11,7 +11,7 @@ from pictures import drawn, matplotlib, plt
 
 import jast
 from jast import plot
-from jast._src.plot.colav import zone_outline
+from jast._src.plot.colav_log import zone_outline
 from jast._src.simulators.colav import planner
 from jast._src.simulators.colav.tracker import PERIOD
 from jast.simulators.colav import SCENARIOS, colav

@@ -9,27 +9,23 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from operator import index
-from typing import NamedTuple
 
-import jax
 import numpy as np
 
 from jast._src.core.episode import Episode
 from jast._src.core.simulator import Simulator
 from jast._src.core.typing import PathLike
-from jast._src.plot import style
+from jast._src.plot import colav_log, style
 from jast._src.plot.style import Axes, FuncAnimation
-from jast._src.simulators.colav.planner import SPEEDS, STILL, ZONES
-from jast._src.simulators.colav.system import COLLISION, ColavState
+from jast._src.simulators.colav.planner import ZONES
+from jast._src.simulators.colav.system import COLLISION
 from jast._src.simulators.colav.tracker import PERIOD
 from jast._src.simulators.svg_states import HULL, placed
 from jast._src.util.checks import number, whole_number
 
-__all__ = ["colav", "colav_animation", "colav_story", "draw_moments", "zone_outline"]
+__all__ = ["colav", "colav_animation", "colav_story", "draw_moments"]
 
 BELIEF, ZONE, DASHED = style.GREEN, style.ORANGE, (0, (3, 1.2))
-OUTLINE = 200  # points of a zone's edge; a convention
 SHADES = ((0.30, "-"), (0.16, "--"), (0.07, ":"))  # of `ZONES`: opacity, edge
 
 
@@ -90,8 +86,8 @@ def colav_story(
         >>> len(jast.plot.colav_story(jast.rollout(jax.random.key(0), sim), sim))
         3
     """
-    states = _states("colav_story", episode, sim)
-    kinds, log = _kinds(episode, states, sim), _log(states)
+    states = colav_log.states_of("colav_story", episode, sim)
+    kinds, log = colav_log.by_kind(episode, states, sim), colav_log.log_of(states)
     edges = PERIOD * np.arange(len(states.step))
     count, size = len(kinds) + 2, (7.4, 1.15 + 1.45 * (len(kinds) + 2))
     each = "kind of disturbance, the distances and the speed"
@@ -126,7 +122,7 @@ def colav_story(
             if ax.get_legend_handles_labels()[0]:
                 ax.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
         axes[0].figure.align_ylabels(axes)
-        axes[0].set_title(_headline(episode, states))
+        axes[0].set_title(colav_log.headline(episode, states))
     return axes
 
 
@@ -165,13 +161,13 @@ def colav_animation(
     from matplotlib.animation import FuncAnimation
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
-    states = _states("colav_animation", episode, sim)
+    states = colav_log.states_of("colav_animation", episode, sim)
     path = style.checked_writable("colav_animation", path)
     number("plot.colav_animation", "fps", fps, lambda v: 0 < v < math.inf, "above 0")
     smooth = whole_number("plot.colav_animation", "smooth", smooth)
-    log = _log(states)
+    log = colav_log.log_of(states)
     steps = len(states.step) - 1
-    low, high = _limits(log, range(steps + 1))
+    low, high = colav_log.limits(log, range(steps + 1))
     with style.styled():
         # an even number of pixels, as films must have
         height = round(40 * (np.clip(4.1 * (high - low)[1] / (high - low)[0], 2.6, 5.0) + 0.9)) / 40
@@ -196,11 +192,11 @@ def colav_animation(
 
 def draw_moments(caller, episode, sim, moments, axes, draw_panel):
     """The Axes of a panel a moment, each filled by ``draw_panel(ax, log, low, high, t)``: the
-    episode's `_Log`, the corners that all panels share, and the step number.
+    episode's `EncounterLog`, the corners that all panels share, and the step number.
     """
-    states = _states(caller, episode, sim)
-    log, moments = _log(states), _moments(caller, moments, states)
-    low, high = _limits(log, moments)
+    states = colav_log.states_of(caller, episode, sim)
+    log, moments = colav_log.log_of(states), colav_log.checked_moments(caller, moments, states)
+    low, high = colav_log.limits(log, moments)
     height = np.clip(3.7 * (high - low)[1] / (high - low)[0], 2.6, 7.0)
     count = len(moments)
     size = (0.7 + 3.7 * count + 2.2, height + 1.45)
@@ -211,23 +207,14 @@ def draw_moments(caller, episode, sim, moments, axes, draw_panel):
             ax.set_xlabel("east (m)")
         axes[0].set_ylabel("north (m)")
         axes[-1].legend(loc="upper left", bbox_to_anchor=(1.02, 1.0))
-        axes[0].figure.suptitle(_headline(episode, states) + "\n", x=0.01, ha="left", fontsize=11)
+        axes[0].figure.suptitle(
+            colav_log.headline(episode, states) + "\n", x=0.01, ha="left", fontsize=11
+        )
     return axes
 
 
 def _draw_panel(ax, log, low, high, t):
     _Panel(ax, log, low, high).show(t)
-
-
-class _Log(NamedTuple):
-    """What the pictures need of an episode's states, row by row."""
-
-    ferry: np.ndarray
-    """[steps + 1, 3]: east (m), north (m), heading (radians, without jumps)."""
-    adversary: np.ndarray
-    believed: np.ndarray
-    order: np.ndarray
-    """[steps + 1]: the speed (m/s) ordered at that state, for the step after it; the last stays."""
 
 
 class _Panel:
@@ -264,120 +251,15 @@ class _Panel:
 
     def show(self, t):
         """The panel ``t`` steps after the start, which need not be whole."""
-        now = [_at(rows, t) for rows in self.log[:3]]
+        now = [colav_log.row_at(rows, t) for rows in self.log[:3]]
         lines = self.ferry, self.adversary, self.believed
         for line, rows, here in zip(lines, self.log[:3], now, strict=True):
             line.set_data(*np.concatenate([rows[: math.ceil(t)], here[None]])[:, :2].T)
         self.error.set_data(*np.stack(now[1:])[:, :2].T)
         for patch, zone in zip(self.zones, ZONES, strict=True):
             east, north, course = now[2]
-            patch.set_xy(zone_outline(zone, north, east, course))
+            patch.set_xy(colav_log.zone_outline(zone, north, east, course))
         for patch, here in zip(self.hulls, now, strict=True):
             patch.set_xy(placed(*HULL.T, *here))
         order = self.log.order[math.floor(t)]
         self.title.set_text(f"t = {t * PERIOD:.0f} s, ordered {order:.2f} m/s")
-
-
-def _states(caller, episode, sim):
-    """s_0 .. s_length as NumPy arrays."""
-    if style.one_episode(caller, episode).states is None and sim is None:
-        must = "have states, or sim be the simulator to replay it on"
-        raise style.wrong(caller, "episode", must, "neither")
-    states = style.states_of(caller, episode, sim, "colav", ColavState)
-    return jax.tree.map(lambda a: np.asarray(a)[: int(episode.length) + 1], states)
-
-
-def _log(states):
-    track, adversary = states.track, states.adversary.pose
-    still = np.hypot(track.v_n, track.v_e) < STILL  # as the planner has it
-    course = np.where(still, 0, np.arctan2(track.v_e, track.v_n))
-    rows = (
-        (states.pose.e, states.pose.n, states.pose.psi),
-        (adversary.e, adversary.n, adversary.psi),
-        (track.e, track.n, course),
-    )
-    choice = np.concatenate([states.choice[1:], states.choice[-1:]])
-    return _Log(
-        *(np.stack([e, n, np.unwrap(psi)], -1).astype(float) for e, n, psi in rows), SPEEDS[choice]
-    )
-
-
-def _at(rows, t):
-    """The row at ``t``, between two by a straight line; at a whole number the row itself."""
-    return np.array([np.interp(t, np.arange(len(rows)), column) for column in rows.T])
-
-
-def zone_outline(zone, n, e, course):
-    """The edge of a zone around an obstacle at (n, e) on a course (radians): [OUTLINE, 2] of
-    (e, n).
-    """
-    angle = np.linspace(0, 2 * np.pi, OUTLINE)
-    ahead = np.cos(angle) * np.where(np.cos(angle) > 0, zone.forward, zone.aft)
-    right = np.sin(angle) * np.where(np.sin(angle) > 0, zone.starboard, zone.port)
-    return placed(ahead, right, e, n, course)
-
-
-def _limits(log, moments):
-    """Corners (east, north) that hold the paths up to the last moment, and the high penalty region
-    at each: the low one would make the ships small.
-    """
-    ships = [rows[: max(moments) + 1, :2] for rows in log[:3]]
-    zones = [zone_outline(ZONES[1], *log.believed[t][[1, 0, 2]]) for t in moments]
-    points = np.concatenate(ships + zones)
-    return points.min(0) - 5, points.max(0) + 5
-
-
-def _moments(caller, moments, states):
-    last = len(states.step) - 1
-    wrong = ValueError(
-        f"plot.{caller}: moments must be at least 1, or step numbers in 0 .. {last}, received"
-        f" {moments!r}"
-    )
-    try:
-        if np.ndim(moments):
-            chosen = [index(t) for t in moments]
-        else:
-            count, nearest = max(index(moments), 0), int(np.argmin(states.near))
-            end = nearest if nearest >= count else last
-            evenly = np.linspace(0, end, count + 1).round().astype(int)
-            chosen = np.unique(evenly[1:])
-    except TypeError:
-        raise wrong from None
-    if not len(chosen) or not all(0 <= t <= last for t in chosen):
-        raise wrong
-    return [int(t) for t in chosen]
-
-
-def _headline(episode, states):
-    nearest = int(np.argmin(states.near))
-    return style.headline(
-        "Ferry and adversary",
-        episode,
-        f"\nclosest approach {states.near[nearest]:.2f} m by t = {nearest * PERIOD:g} s (collision:"
-        f" below {COLLISION:g} m)",
-    )
-
-
-def _kinds(episode, states, sim):
-    """``{label: {name: [steps] values}}``, a label for each kind of disturbance."""
-    n, x = int(episode.length), episode.disturbances
-    model = next(iter(getattr(getattr(sim, "init", None), "args", ())), None)
-    if not isinstance(x, dict):  # one kind: which, the simulator says, or what the states remember
-        kind = "noise" if np.ndim(x) == 2 else "delay"
-        if kind == "delay" and not states.delay.any():
-            same = np.allclose(np.clip(x[:n], 0, 1), states.steering[1:])
-            kind = "steering" if same else "delay"
-        x = {model.kinds[0] if hasattr(model, "kinds") else kind: x}
-    x = {kind: np.asarray(a, float)[:n] for kind, a in x.items()}
-    longest = getattr(model, "longest", None)
-    rows = {}
-    if "delay" in x and longest is None:
-        rows["delay (share)"] = {"": x["delay"]}
-    elif "delay" in x:
-        rows["delay (s)"] = {"": x["delay"] * float(longest)}
-    if "steering" in x:
-        rows["steering (rad/s)"] = {"": x["steering"] - 0.5}
-    if "noise" in x:
-        position, velocity = (np.hypot(*x["noise"][:, i : i + 2].T) for i in (0, 2))
-        rows["size of noise"] = {"position (m)": position, "velocity (m/s)": velocity}
-    return rows

@@ -9,7 +9,8 @@ import numpy as np
 from jast._src.core.episode import Episode
 from jast._src.core.simulator import Simulator
 from jast._src.plot import style
-from jast._src.plot.colav import draw_moments, zone_outline
+from jast._src.plot.colav import draw_moments
+from jast._src.plot.colav_log import zone_outline
 from jast._src.plot.style import Axes
 from jast._src.simulators.colav.planner import ZONES
 from jast._src.simulators.colav.tracker import PERIOD
