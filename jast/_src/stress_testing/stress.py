@@ -16,9 +16,10 @@ from jast._src.runtime._jax import briefly
 from jast._src.runtime.checkpoints import keep_answers, open_checkpoint
 from jast._src.runtime.host_errors import runs_apart, telling_runs
 from jast._src.runtime.progress_bar import Watch
+from jast._src.stress_testing.budget_shares import DEFAULT_BUDGET
 from jast._src.stress_testing.explorers import has_quantiles
 from jast._src.stress_testing.report import Report
-from jast._src.stress_testing.stress_test import DEFAULT_BUDGET, StressTest
+from jast._src.stress_testing.stress_test import StressTest
 from jast._src.util import checks
 from jast._src.util.display import call_settings
 

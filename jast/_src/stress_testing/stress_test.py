@@ -2,7 +2,6 @@
 
 import warnings
 from pathlib import Path
-from typing import NamedTuple
 
 import jax
 import numpy as np
@@ -15,8 +14,7 @@ from jast._src.core.rewards import likelihood
 from jast._src.core.simulator import Simulator
 from jast._src.estimate import budgets
 from jast._src.estimate.budgets import MIN_POPULATION_BUDGET
-from jast._src.estimate.failure_probability import MAX_SURROGATE_NUMBERS, failure_probability
-from jast._src.estimate.failure_probability import MIN_BUDGET as MIN_ESTIMATE_BUDGET
+from jast._src.estimate.failure_probability import failure_probability
 from jast._src.estimate.few_calls import few_calls
 from jast._src.estimate.monte_carlo import monte_carlo
 from jast._src.estimate.population.descents import SETTINGS, cool_failures
@@ -29,6 +27,7 @@ from jast._src.runtime.device import on_cpu, where_few_points_run
 from jast._src.runtime.host_errors import failing_runs, runs_made, runs_on_host
 from jast._src.search.refine.modes import Mode, Modes, modes, owners, spread
 from jast._src.search.refine.refine import refine
+from jast._src.stress_testing.budget_shares import DEFAULT_BUDGET, BudgetShares, divided
 from jast._src.stress_testing.explorers import (
     EXPLORERS,
     ExplorerResult,
@@ -42,9 +41,8 @@ from jast._src.stress_testing.explorers import (
 from jast._src.stress_testing.mode_shares import mode_shares, shares_cost
 from jast._src.stress_testing.report import Report, Tried
 
-__all__ = ["DEFAULT_BUDGET", "StressTest"]
+__all__ = ["StressTest"]
 
-DEFAULT_BUDGET = 200_000  # evaluations by default where populations are not the answer
 REDRAWN_EPISODES = 400
 """Draws of the estimate's proposal, where only it found failures, but no more than all batches
 together may have of a small budget."""
@@ -91,25 +89,6 @@ REFINED_FACTOR = 8  # failures that refinement starts from for each that is retu
 FOUND_FACTOR = 4  # failures of one explorer for each that is returned
 
 
-class BudgetShares(NamedTuple):
-    """Of the budget; what is left is for the probability."""
-
-    nominal: float
-    search: float
-    slow_search: float
-    refine: float
-
-
-LARGE_SHARES = BudgetShares(nominal=0.05, search=0.15, slow_search=0.14, refine=0.18)
-"""Where the estimate finds its own proposal."""
-SURROGATE_SHARES = BudgetShares(nominal=0.05, search=0.3, slow_search=0, refine=0.35)
-"""Where a surrogate tells the probability with few evaluations."""
-MOMENTS_SHARES = BudgetShares(nominal=0.05, search=0.2, slow_search=0, refine=0.2)
-"""Where the moments of an episode of many numbers tell it with few evaluations."""
-COUNTING_SHARES = BudgetShares(nominal=0.125, search=0.35, slow_search=0.2, refine=0.325)
-"""Where only plain draws tell it."""
-
-
 class StressTest:
     """What is known so far, and what it cost.
 
@@ -128,16 +107,9 @@ class StressTest:
         self.spent = self.invalid = 0
         self.residual = self.late = np.nan
         self.has_points = has_quantiles(sim)
-        large = (1 - sum(LARGE_SHARES)) * budget >= MIN_ESTIMATE_BUDGET
         self.hosted, self.made, self.failing_runs = runs_on_host(sim), runs_made(sim), 0
         self.cheap = self.has_points and budgets.uses_populations(sim, budget)
-        shares = COUNTING_SHARES
-        if self.has_points:
-            many_numbers = transform.dimension(sim) > MAX_SURROGATE_NUMBERS
-            few = MOMENTS_SHARES if many_numbers else SURROGATE_SHARES
-            shares = LARGE_SHARES if large else few
-        # what populations do not answer gains little from more
-        self.parts = BudgetShares(*(int(share * min(budget, DEFAULT_BUDGET)) for share in shares))
+        self.parts = divided(sim, budget, self.has_points)
         self.modes_budget = int(MODES_SHARE * budget)
         # evaluations that a black box, which must not run once too often, keeps for its estimate
         self.last = int(LAST_SHARE * budget) if self.hosted else 0
