@@ -34,7 +34,7 @@ from jast._src.util.checks import check_random_key, whole_number
 from jast._src.util.intervals import clopper_pearson
 from jast._src.util.pytrees import with_rows_of, zero_where
 
-__all__ = ["BRIEF", "Nominal", "describe_undisturbed", "nominal", "outcome", "rate_of"]
+__all__ = ["Nominal", "describe_undisturbed", "nominal", "outcome", "rate_of"]
 
 BRIEF = 4096
 """Episodes up to which the program is compiled quickly, as it runs briefly: on the ferry and three

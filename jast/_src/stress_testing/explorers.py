@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jast._src.core.actions import wide
-from jast._src.core.counter_prng import numpy_generator
+from jast._src.core.counter_prng import counter_key, numpy_generator
 from jast._src.core.episode import Episode, replay, rollout
 from jast._src.core.failures import empty
 from jast._src.core.nominal import Nominal, rate_of
@@ -20,6 +20,12 @@ from jast._src.core.signature import signature_of
 from jast._src.core.simulator import Simulator
 from jast._src.estimate.gaussians.design_points import design_points
 from jast._src.estimate.host_populations import cool, explore
+from jast._src.estimate.population.descents import population_size
+from jast._src.estimate.population.particle_moves import (
+    Particles,
+    allocate_particles,
+    draw_particles,
+)
 from jast._src.normal_space import transform
 from jast._src.normal_space.evaluate_points import evaluate_points, lanes_of
 from jast._src.normal_space.mode_coordinates import centred
@@ -80,9 +86,12 @@ def plain_draws(key: jax.Array, sim: Simulator, budget: int) -> ExplorerResult:
     return _draw_points(key, sim, budget)[0]
 
 
-def nominal_points(key: jax.Array, sim: Simulator, episodes: int) -> tuple[Nominal, Episode]:
+def nominal_points(
+    key: jax.Array, sim: Simulator, episodes: int, by_populations: bool = False
+) -> tuple[Nominal, Episode]:
     """`jast.nominal` by points, and failing episodes of it [m]; the undisturbed one has the reward
     of `collect` here, too, and is a point where all modes are medians: no program is for it alone.
+    Nor is one for the others: the program of ``by_populations``, or of the searches, draws them.
     """
     signature, reward, quiet = signature_of(sim), likelihood(sim), None
     offers = [signature.disturbance, *([signature.start] if signature.random_start else [])]
@@ -91,7 +100,8 @@ def nominal_points(key: jax.Array, sim: Simulator, episodes: int) -> tuple[Nomin
         quiet = replay(sim, index_tree(e, 0), reward=reward)
     elif all(o.mode for o in offers):
         quiet = rollout(key, sim, undisturbed(sim), reward)  # draws nothing
-    found, distance = _draw_points(key, sim, episodes)
+    draw = _draw_particles if by_populations else _draw_points
+    found, distance = draw(key, sim, episodes)
     valid = episodes - found.invalid
     rate, interval = rate_of(found.failing, found.invalid, episodes)
     n = Nominal(
@@ -123,6 +133,22 @@ def _draw_points(key, sim, n):
         failures, log_p = failures[best], log_p[best]
     episodes = failures_at(sim, failures).episodes
     return ExplorerResult(episodes, n, int(failing), int(invalid)), distance
+
+
+def _draw_particles(key, sim, n):
+    """The same, of the failures one alone."""
+    size = population_size(sim)
+    particles, failing, invalid, distance = allocate_particles(sim, size), 0, 0, 0.0
+    first = np.zeros((0, transform.dimension(sim)), transform.normal_numbers(sim))
+    for i, begin in enumerate(range(0, n, size)):
+        m = min(size, n - begin)
+        particles, wrong = draw_particles(sim, particles, counter_key(key, 1, i), m)
+        p = Particles(*(np.asarray(a)[:m] for a in particles))
+        fails = p.score == -np.inf
+        failing, invalid = failing + int(fails.sum()), invalid + wrong
+        distance += float(p.distance[p.score < np.inf].sum(dtype=np.float64))
+        first = np.concatenate([first, p.z[fails]])[:1]
+    return ExplorerResult(failures_at(sim, first).episodes, n, failing, invalid), distance
 
 
 def falsified(key: jax.Array, sim: Simulator, budget: int) -> ExplorerResult:

@@ -9,7 +9,7 @@ import numpy as np
 from jast._src.core.black_boxes import runs_for_objects
 from jast._src.core.episode import Episode, rollout, stacked
 from jast._src.core.failures import Failures, collect, empty, merge, rank
-from jast._src.core.nominal import BRIEF, nominal
+from jast._src.core.nominal import nominal
 from jast._src.core.rewards import likelihood
 from jast._src.core.simulator import Simulator
 from jast._src.estimate import budgets
@@ -59,6 +59,7 @@ OPTIMAL_RESIDUAL = 1e-2  # a residual at which a failure is locally likeliest
 FEW_MODES = 4
 """With so few modes, and a likeliest failure that is locally so, `slow_cross_entropy` would find
 nothing else: its evaluations are the estimate's."""
+NOMINAL = 4096  # plain draws where populations follow, which begin with some themselves
 COOLING_SHARE = 0.2  # of the evaluations, to cool failures of the populations to the likeliest
 COOLING_BESIDE_ACCELERATOR = 2**20
 """Of them at most where an accelerator simulates: the CPU cools, and takes some five seconds. A
@@ -145,12 +146,11 @@ class StressTest:
 
     def run_nominal(self):
         """The system as it is."""
-        # populations draw plainly, too, and so few are compiled quickly
-        key, episodes = self.next_key(), BRIEF if self.cheap else self.parts.nominal
+        key, episodes = self.next_key(), NOMINAL if self.cheap else self.parts.nominal
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)  # the report says it
-            if self.has_points and not self.hosted and not self.cheap:
-                self.nominal, found = nominal_points(key, self.sim, episodes)
+            if self.has_points and not self.hosted:
+                self.nominal, found = nominal_points(key, self.sim, episodes, self.cheap)
             else:
                 self.nominal = nominal(key, self.sim, episodes)
                 found, first = empty(self.sim).episodes, self.nominal.first
