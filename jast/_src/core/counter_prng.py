@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from jast._src.runtime._jax import define_prng_impl
+from jast._src.runtime._jax import define_prng_impl, quick
 
 __all__ = ["COUNTER", "coin", "counter_key", "numpy_generator", "tree_keys"]
 
@@ -77,7 +77,7 @@ def coin(key):
     return (jax.random.key_data(key)[..., 1] & 1).astype(bool)
 
 
-@partial(jax.jit, static_argnums=1)
+@partial(quick, static_argnums=1)
 def tree_keys(key, n):
     """``n`` counter keys, one a tree, from the user's ``key`` (consumed); the key of tree k does
     not depend on ``n``.

@@ -101,11 +101,11 @@ def jit(function: Callable[..., Any], **options: Any) -> Callable[..., Any]:
     return _compiled(function, lambda: _BRIEF.get() and not told, _BRIEFLY, options)
 
 
-def quick(function: Callable[..., Any]) -> Callable[..., Any]:
+def quick(function: Callable[..., Any], **options: Any) -> Callable[..., Any]:
     """`jax.jit` for a program that runs a few episodes: compiled without optimisation, in a
     fraction of the time, and slower.
     """
-    return _compiled(function, lambda: True, _QUICKLY, {})
+    return _compiled(function, lambda: True, _QUICKLY, options)
 
 
 def _compiled(function, wanted, how, options):

@@ -20,7 +20,7 @@ from jast._src.core.failures import collect, merge
 from jast._src.core.rewards import LogLikelihood
 from jast._src.core.signature import signature_of
 from jast._src.core.simulator import Simulator
-from jast._src.runtime._jax import is_tracing, jit
+from jast._src.runtime._jax import is_traced, is_tracing, jit
 from jast._src.runtime.host_errors import runs_on_host
 from jast._src.runtime.jax_settings import run_in_thread
 from jast._src.search.lanes import NEVER, Tally, blank_episodes, play_drawn
@@ -68,15 +68,15 @@ def calibrate(sim: Simulator, density: str, widen: str) -> Calibration:
     lanes = HOSTED_EPISODES if host else EPISODES
     widths = WIDTHS[:1] if widen == "never" else WIDTHS
 
-    work = partial(_calibrated, sim, density, widths, widen == "blind", lanes)
+    work = partial(_calibrated, sim, density, widths, np.bool_(widen == "blind"), lanes)
     if not host or is_tracing():
         return work()
     return run_in_thread(lambda: jax.block_until_ready(work()))
 
 
-@partial(jit, static_argnames=("density", "widths", "blind", "lanes"))
+@partial(jit, static_argnames=("density", "widths", "lanes"))
 def _calibrated(
-    sim: Simulator, density: str, widths: tuple[float, ...], blind: bool, lanes: int
+    sim: Simulator, density: str, widths: tuple[float, ...], blind: Any, lanes: int
 ) -> Calibration:
     key, real = tree_keys(jax.random.key(0), 1)[0], signature_of(sim).dtype
     live, number = jnp.ones((lanes,), bool), jnp.arange(lanes, dtype=jnp.int32)
@@ -91,9 +91,8 @@ def _calibrated(
         share = jnp.mean(e.failure, dtype=real)
         near = jnp.sort(jnp.where(e.failure, 0, e.distance))[int(NEAR_SHARE * (lanes - 1))]
         enough = share >= FAILING_SHARE
-        if blind:
-            most = jnp.max(jnp.where(jnp.isfinite(e.distance), e.distance, -jnp.inf))
-            enough |= most > jnp.min(jnp.where(e.failure, jnp.inf, e.distance))
+        most = jnp.max(jnp.where(jnp.isfinite(e.distance), e.distance, -jnp.inf))
+        enough |= blind & (most > jnp.min(jnp.where(e.failure, jnp.inf, e.distance)))
         put = partial(lax.dynamic_update_slice_in_dim, start_index=i * lanes, axis=0)
         episodes = jax.tree.map(put, episodes, e)
         tally = tally.add(Tally.of(played, live, order))
@@ -140,12 +139,13 @@ def with_calibration(
     if calibration is None:
         return found
     n, e = calibration.tally, calibration.episodes
-    best = _better(_best(sim, reward, e), found.best)
     if found.failures is None:  # traced
+        best = _better(_best(sim, reward, e, jnp), found.best)
         later = jnp.where(found.first_failure < 0, -1, found.first_failure + n.episodes)
         first = jnp.where(n.first < NEVER, n.first, later)
     else:
-        n, best = jax.device_get((n, best))
+        n, e = jax.device_get((n, e))
+        best = _better(jax.device_get(_best(sim, reward, e, np)), found.best)
         n = Tally(*(int(v) for v in n[:5]), n.failing)
         later = None if found.first_failure is None else found.first_failure + n.episodes
         first = n.first if n.first < NEVER else later
@@ -165,17 +165,17 @@ def with_calibration(
     )
 
 
-@jax.jit
-def _best(sim: Simulator, reward: Any, e: Episode) -> Episode:
-    """The best of the episodes, likeliest of those that failed or else nearest, as it replays."""
-    score = jnp.where(e.failure, e.reward, -e.distance)
-    i = jnp.argmax(jnp.where(e.failure | ~jnp.any(e.failure), score, -jnp.inf))
+def _best(sim: Simulator, reward: Any, e: Episode, numpy: Any) -> Episode:
+    """The best of the episodes, likeliest of those that failed or else nearest, as it replays;
+    ``numpy``: NumPy, or that of JAX.
+    """
+    score = numpy.where(e.failure, e.reward, -e.distance)
+    i = numpy.argmax(numpy.where(e.failure | ~numpy.any(e.failure), score, -numpy.inf))
     x0, x, length = index_tree((e.x0, e.disturbances, e.length), i)
     return play_back(sim, reward, x0, x, length)
 
 
-@jax.jit
 def _better(a: Episode, b: Episode) -> Episode:
     """The one that failed, or else has the higher reward; ``b`` where they are equal."""
     first = (a.failure & ~b.failure) | ((a.failure == b.failure) & (a.reward > b.reward))
-    return select(first, a, b)
+    return select(first, a, b) if is_traced(first) else a if first else b

@@ -27,7 +27,7 @@ from jast._src.core.simulator import Simulator, require_simulator
 from jast._src.core.typing import Actions, Callback, PathLike, PRNGKey, Reward
 from jast._src.normal_space import sequences
 from jast._src.runtime import work
-from jast._src.runtime._jax import jit
+from jast._src.runtime._jax import jit, quick
 from jast._src.runtime.host_errors import incidents
 from jast._src.runtime.memory import require_episodes
 from jast._src.search.calibration import with_calibration
@@ -234,8 +234,7 @@ class _Search:
     ) -> tuple[State, Tally, jax.Array, Trials | None]:
         """One iteration of all trees."""
         parts = self.keys, self.sim, self.reward, self.actions, self.shares, self.plan
-        state, tally, trials = _iteration(*parts, state, begin)
-        best = state.elites.episode.reward[:, 0]
+        state, tally, best, trials = _iteration(*parts, state, begin)
         return state, tally, best, jax.tree.map(jnp.transpose, trials) if self.record else None
 
     def result(self, state: State, log: Log, settings: dict[str, Any]) -> SearchResult:
@@ -261,8 +260,8 @@ class _Search:
 
 @partial(jit, static_argnums=5)
 def _iteration(keys, sim, reward, actions, shares, plan, state, begin):
-    """One iteration of all trees, from episode number ``begin`` on: (`State`, `Tally`,
-    `Trials`).
+    """One iteration of all trees, from episode number ``begin`` on: (`State`, `Tally`, the
+    best rewards so far [trees], `Trials`).
     """
     (trees,), samples = keys.shape, plan.samples
     number = begin + jnp.arange(samples, dtype=jnp.int32)
@@ -287,7 +286,8 @@ def _iteration(keys, sim, reward, actions, shares, plan, state, begin):
     new = Elites(episode, z, tag, number=number, count=once)
     elites = jax.vmap(_merge)(state.elites, new)
     proposals = jax.vmap(lambda g, e: _fit(g, e, shares, plan))(state.proposals, elites)
-    return State(elites, proposals), tally, by_tree(played.trials())
+    best = elites.episode.reward[:, 0]
+    return State(elites, proposals), tally, best, by_tree(played.trials())
 
 
 def _propose(keys, sim, shares, plan, state):
@@ -338,7 +338,7 @@ def _merge(elites, new):
     return best._replace(episode=best.episode._replace(reward=reward), count=counts)
 
 
-@partial(jax.jit, static_argnums=(1, 2, 3))
+@partial(quick, static_argnums=(1, 2, 3))
 def _first_state(sim, plan, trees, k, width, around):
     """No elites and the first proposals, of every tree."""
 
@@ -360,7 +360,7 @@ def _first_state(sim, plan, trees, k, width, around):
     return jax.tree.map(lambda a: jnp.broadcast_to(a, (trees, *a.shape)), one)
 
 
-@jax.jit
+@quick
 def _best_episode(elites):
     """The best episode of all trees."""
     e = index_tree(elites.episode, np.s_[:, 0])
@@ -368,7 +368,7 @@ def _best_episode(elites):
     return index_tree(e, i)
 
 
-@partial(jax.jit, static_argnums=1)
+@partial(quick, static_argnums=1)
 def _best_failures(elites, top):
     """The ``top`` best distinct failures of all trees: (episodes, tree, number, count), reward -inf
     where there are fewer.

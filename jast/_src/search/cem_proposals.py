@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jast._src.core import actions as choices
+from jast._src.core.episode import stacked
 from jast._src.core.failures import Failures
 from jast._src.core.signature import signature_of
 from jast._src.core.simulator import Simulator
@@ -75,8 +76,8 @@ def latents_around(sim, actions, failures, settings):
     instance("cem", "actions", actions, choices.Wide | choices.Quantiles, words)
     if not len(failures):
         return ()
-    one = jax.tree.map(lambda a: jnp.asarray(a)[None], failures.best._replace(states=None))
+    one = stacked([failures.best])
     signature = signature_of(sim)
     of_start = signature.random_start and signature.start.quantile
-    z0, z = latents(sim, (one.x0, one.disturbances, one.length), of_start)
+    z0, z = jax.device_get(latents(sim, (one.x0, one.disturbances, one.length), of_start))
     return z0, index_tree(z, 0)

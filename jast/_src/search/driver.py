@@ -248,7 +248,8 @@ def finish(
     sim, reward = search.sim, search.reward
     trees = np.zeros(len(numbers), int) if trees is None else trees
     # so that one that no longer fails is counted as dropped
-    candidates = jax.device_get(candidates)._replace(failure=np.ones(len(numbers), bool))
+    best, candidates = jax.device_get((best, candidates))
+    candidates = candidates._replace(failure=np.ones(len(numbers), bool))
     tally = log.tally
     found = archive.collect(sim, reward, candidates, trees, numbers, tally.failures, search.top)
     if counts is not None:

@@ -14,7 +14,7 @@ from jax import lax
 from jast._src.core.counter_prng import COUNTER, tree_keys
 from jast._src.core.episode import Episode, play_back
 from jast._src.runtime import work
-from jast._src.runtime._jax import custom_vmap, jit
+from jast._src.runtime._jax import custom_vmap, is_brief, jit, quick
 from jast._src.runtime.backends import Task, UnitContext
 from jast._src.runtime.memory import size
 from jast._src.runtime.progress_bar import Watch
@@ -86,7 +86,10 @@ _prune = jit(prune, static_argnames=("children", "memoize"), donate_argnames=("t
 _recounted = jit(recounted, static_argnames=("children", "memoize"))
 _edges = jit(edges_of, static_argnames=("children",))
 _branches = jit(branches_of, static_argnames=("children",))
+# briefly: of the ferry it is compiled in 1.0 CPU seconds in place of 2.3, and the 516 episodes of
+# four trees then take .02 in place of .006
 _rebuild = jit(rebuild, static_argnames=("memoize",))
+_rebuild_quickly = quick(rebuild, static_argnames=("memoize",))
 
 
 def bytes_per_tree(problem, plan):
@@ -174,7 +177,8 @@ def _one_group(turn: Round, number: int, context: UnitContext) -> TreeBatch:
     lane, i = _candidates(log, outcome, candidates)
     wanted = candidates + len(group)
     rows = (np.resize(a, wanted).astype(np.int32) for a in (lane, i))
-    found = _rebuild(problem, tree, *rows, plan.memoize)
+    rebuilt = _rebuild_quickly if is_brief() else _rebuild
+    found = rebuilt(problem, tree, *rows, plan.memoize)
     found = index_tree(jax.device_get(found), np.s_[: len(lane)])
     none = jax.tree.map(np.zeros_like, turns[0])
     turns += [none] * (plan.prunes - len(turns))
