@@ -41,7 +41,7 @@ from jast._src.util import display
 from jast._src.util.checks import check_random_key, one_of, whole_number
 from jast._src.util.display import call_settings
 from jast._src.util.intervals import checked_level
-from jast._src.util.pytrees import index_tree
+from jast._src.util.pytrees import index_tree, join_rows
 
 __all__ = [
     "Traces",
@@ -55,6 +55,9 @@ __all__ = [
 ]
 
 LANES = 16384  # episodes of a chunk, at most
+TOGETHER = (
+    8  # chunks that are added to the sums at a time: these keep rows, and copy what they keep
+)
 PROBES = 256  # of the model's own episodes, which a proposal that may not cover it is tried on
 
 
@@ -225,20 +228,26 @@ def chunks(simulate, shared, lanes, watch, placement=work.HERE, plain=None):
     samples = watch.total
 
     def fold(kept, i, rows):
-        total, done = kept
+        total, done, waiting = kept
         rows = index_tree(rows, np.s_[: samples - i * lanes])
-        own = None if plain is None else plain(i)[: len(rows.failure)]
-        return weight_sums.add_traces(total, rows, own), done + len(rows.failure)
+        n = len(rows.failure)
+        waiting = (*waiting, (rows, np.zeros(n, bool) if plain is None else plain(i)[:n]))
+        kept = total, done + n, waiting
+        return added(kept) if len(waiting) == TOGETHER else kept
+
+    def added(kept):
+        total, done, waiting = kept
+        return (weight_sums.add_traces(total, *join_rows(*waiting)) if waiting else total), done, ()
 
     task = Task(simulate, shared, lambda: Traces(*Traces._fields))
 
     def size(done):
         return min(done * lanes, samples)
 
-    start = weight_sums.empty_sums(samples), 0
+    start = weight_sums.empty_sums(samples), 0, ()
     with watch:
         ran = work.run(task, -(-samples // lanes), fold, start, watch, placement, size=size)
-    total, done = ran.state
+    total, done, _ = added(ran.state)
     short = work.describe_missing("episodes", ran, done, samples)
     if ran.left_out:
         return total, (), (short, *map(str, ran.incidents))
