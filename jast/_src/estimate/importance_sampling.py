@@ -55,9 +55,7 @@ __all__ = [
 ]
 
 LANES = 16384  # episodes of a chunk, at most
-TOGETHER = (
-    8  # chunks that are added to the sums at a time: these keep rows, and copy what they keep
-)
+TOGETHER = 8  # chunks that are added to the sums at a time, as these copy the rows that they keep
 PROBES = 256  # of the model's own episodes, which a proposal that may not cover it is tried on
 
 
