@@ -14,8 +14,11 @@ import jast
 from benchmarks.few_calls import SlowLane, diffusion, plane, planes, slow_lane
 from jast._src.estimate.estimate import estimate_from_mean
 from jast._src.estimate.gaussians import lines
+from jast._src.estimate.gaussians.family import GaussianFamily
 from jast._src.estimate.gaussians.half_spaces import Planes
-from jast._src.estimate.proposal_search.final_lines import Lines, add_lines
+from jast._src.estimate.proposal_search import final_lines
+from jast._src.estimate.proposal_search.final_lines import Lines, add_lines, draw_half_by_lines
+from jast._src.estimate.proposal_search.search_state import SearchState, search_context
 from jast.simulators import limit_state
 
 AXES = np.eye(3)
@@ -165,5 +168,19 @@ def test_planes_and_diffusions_to_a_few_per_cent():
 def test_lines_of_a_black_box_stay_within_its_budget():
     SlowLane.runs = 0
     found = jast.estimate.failure_probability(jax.random.key(0), slow_lane(), 1000)
-    assert any("tell half of it" in line for line in found.history)
+    assert any(line.startswith("lines: ") and " more" in line for line in found.history)
     assert SlowLane.runs <= 1000 and found.episodes <= 1000
+
+
+def test_lines_that_can_afford_no_more_are_the_first_ones(drawn, monkeypatch):
+    monkeypatch.setattr(final_lines, "draw_lines", lambda rng, sim, planes, n, dtype: (ones, 7 * n))
+    ones = np.ones(final_lines.FIRST_LINES)
+    f = GaussianFamily(limit_state(lambda x: 3.5 - x[0], 3), 150, search_context(jax.random.key(0)))
+    state, found = draw_half_by_lines(f, SearchState(planes=half_spaces(3.5), efficiency=0.4))
+    assert len(found.values) == len(ones) and state.spent == 7 * len(ones)
+
+
+def test_intervals_of_modes_move_with_the_mean(drawn):
+    two = drawn._replace(modes=np.array([0.6, 0.4]), mode_intervals=np.array([[5e-5, 7e-5]] * 2))
+    found = add_lines(two, Lines(math.log(1.2e-4), np.linspace(0.9, 1.1, 100), 1.0))
+    np.testing.assert_allclose(found.mode_intervals, 1.2 * two.mode_intervals)

@@ -12,13 +12,15 @@ from functools import partial
 
 import numpy as np
 
-from jast._src import blackbox
+from jast._src.blackbox import environment, programs, readings, rows, time_limit, worker
 from jast._src.blackbox.worker import END, HEAD, NAME, install
 from jast._src.util.checks import import_library
 
 __all__ = ["AGAIN", "JUDGE", "PROBE", "START", "Worker", "pack"]
 
 NEEDS = "jast.blackbox with workers >= 1"
+OF_WORKERS = environment, programs, readings, rows, time_limit, worker
+"""What runs in a worker."""
 START = 60.0  # seconds that a worker may take to start, and to load the system
 
 
@@ -51,13 +53,14 @@ SERVE, PROBE, CONFIGURE, JUDGE, AGAIN = map(
 
 
 def pack(system, spec):
-    """The system as bytes; this room's part of them by value, so that a worker need not import it.
-    Raises ValueError for one that cannot be sent.
+    """The system as bytes; what a worker runs of this room by value, so that it need not import
+    jast. Raises ValueError for one that cannot be sent.
     """
     cloudpickle = import_library(NEEDS, "cloudpickle", "blackbox")
-    own = blackbox.__name__ not in cloudpickle.list_registry_pickle_by_value()
-    if own:
-        cloudpickle.register_pickle_by_value(blackbox)
+    registered = cloudpickle.list_registry_pickle_by_value()
+    own = [m for m in OF_WORKERS if m.__name__ not in registered]
+    for module in own:
+        cloudpickle.register_pickle_by_value(module)
     try:
         return cloudpickle.dumps(_Install(system, spec))
     except Exception as error:
@@ -67,8 +70,8 @@ def pack(system, spec):
             " inside of it, not around it"
         ) from error
     finally:
-        if own:
-            cloudpickle.unregister_pickle_by_value(blackbox)
+        for module in own:
+            cloudpickle.unregister_pickle_by_value(module)
 
 
 class Worker:

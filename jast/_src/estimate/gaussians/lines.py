@@ -44,6 +44,9 @@ NEAREST = 1e-3
 NODES = 32
 """Places of a tail at which the share of a half-space in it is taken."""
 
+PRODUCTS = 2**22
+"""Places times half-spaces that are looked at together: 32 megabytes an array."""
+
 
 class Line(NamedTuple):
     """n lines. On the host."""
@@ -87,8 +90,8 @@ def draw_lines(
 
 
 def _exp(log):
-    """exp, bounded so that squares are finite."""
-    return np.exp(np.minimum(log, 300.0))
+    """exp, bounded so that cubes are finite."""
+    return np.exp(np.minimum(log, 200.0))
 
 
 class Search(NamedTuple):
@@ -151,7 +154,7 @@ def _nearer(known, failing, g):
     both = np.isfinite(safe) & np.isfinite(failed)
     middle[both] = (safe[both] + failed[both]) / 2
     root = np.where(lost, middle, root)
-    error = np.minimum(np.abs(root - place), np.maximum(root - safe, failed - root))
+    error = np.minimum(np.abs(root - place), np.maximum(np.abs(root - safe), np.abs(failed - root)))
     next_place = np.where(lost, root, base + np.where(step > 0, SHORT, 1.0) * step)
     return Search(next_place, base, left, slope, safe, failed, root, error)
 
@@ -186,6 +189,10 @@ def _share(planes, line, place):
     """[n, m] the part of what fails at m places of each line that its own half-space counts: as
     likely as the place is under the model moved to that half-space, and not to another.
     """
+    n, most = len(place), max(PRODUCTS // (place.shape[1] * len(planes.depth)), 1)
+    if n > most:
+        parts = [np.s_[i : i + most] for i in range(0, n, most)]
+        return np.concatenate([_share(planes, index_tree(line, i), place[i]) for i in parts])
     along = planes.normal[line.plane] @ planes.normal.T
     reach = (line.origin @ planes.normal.T)[:, None] + place[..., None] * along[:, None]
     log_of = planes.depth * (reach - planes.depth)

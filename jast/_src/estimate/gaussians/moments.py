@@ -43,7 +43,7 @@ start."""
 ROOTS = 3
 """Runs at most to see how deep a half-space is on the way to its own design point."""
 FARTHER = 2.0
-"""Standard deviations at most that one of them goes on."""
+"""Standard deviations at most that one of them goes on, or back."""
 BATCHES = 3
 """Batches that a proposal is fitted to, of a twenty-fifth of the budget each."""
 
@@ -180,14 +180,14 @@ def _to_their_roots(f, state, planes, end):
             break
         aim = INSIDE * depth[unknown, None] * planes.normal[unknown]
         _, g = distances(f.sim, aim.astype(f.dtype))
-        left = np.nan_to_num(g[np.arange(len(unknown)), planes.moment[unknown]])
-        farther = np.minimum(left / planes.rate[unknown], FARTHER)
-        new = INSIDE * depth[unknown] + farther
+        left = g[np.arange(len(unknown)), planes.moment[unknown]]
+        new = INSIDE * depth[unknown] + np.clip(left / planes.rate[unknown], -FARTHER, FARTHER)
+        new = np.where(np.isnan(left), depth[unknown], new)  # behind another one
         runs += len(unknown)
         far = np.abs(new - depth[unknown]) > KNOWN
         depth[unknown], unknown = new, unknown[far]
     text = f"moments: {len(unknown)} of {len(depth)} boundaries not where they were said to be"
-    return state.note(text, runs), planes._replace(depth=depth)
+    return state.note(text, runs), planes._replace(depth=np.where(depth > 0, depth, planes.depth))
 
 
 def _fit_batches(f, state, planes):

@@ -133,8 +133,10 @@ def _answer(request, context, reasons):
     first = _search_moments(request, context)
     serves = first.suffices and is_efficient(first.state, s.family_efficiency)
     state, rest = first.state, request._replace(budget=request.budget - first.state.spent)
-    if serves or rest.budget < s.moments_alone_budget:
-        return _draw_moments(request, _audit(first) if serves else first, reasons)
+    if serves:
+        return _draw_moments(request, _audit(first), reasons)
+    if rest.budget < s.moments_alone_budget:
+        return _draw(request, first, reasons)
     return _after(state, _draw(rest, _search(rest, context), reasons))
 
 
@@ -270,7 +272,7 @@ def _audit(search):
 
 def _draw_moments(request, search, reasons):
     """The `Estimate` of what is left of the budget, where half-spaces are the proposal."""
-    state, lines = draw_half_by_lines(*search)
+    state, lines = draw_half_by_lines(*search) if search.suffices else (search.state, None)
     search = search._replace(state=state)
     if lines is None:
         return _draw(request, search, reasons)

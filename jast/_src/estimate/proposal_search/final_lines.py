@@ -22,6 +22,7 @@ __all__ = ["Lines", "add_lines", "draw_half_by_lines"]
 
 FIRST_LINES = 12
 """Lines that tell whether more are worth it: a fiftieth of 2000 evaluations. A convention."""
+TINY = np.finfo(float).tiny
 MAX_SPREAD = 0.5
 """Relative standard deviation of lines up to which a hundred of them tell their mean: if they are
 log-normal, 3 % of it lies beyond the greatest of a hundred, and with a deviation of 2 it is 14 %.
@@ -41,7 +42,7 @@ class Lines(NamedTuple):
     values: np.ndarray
     """[n] independent unbiased estimates of the probability, over exp(``log_scale``)"""
     weight: float
-    """Of their mean beside that of draws, by what the variances were before these were drawn"""
+    """Of their mean beside that of draws, by the variances of the first of them and of batches"""
 
     @property
     def answer(self) -> Answer:
@@ -81,10 +82,10 @@ def draw_half_by_lines(f: GaussianFamily, state: SearchState) -> tuple[SearchSta
     state = state.note(text, runs)
     if of_line >= of_draw or spread > MAX_SPREAD**2 * mean**2:
         return state, None
-    rest = max(left // 2 - runs, 0) * FIRST_LINES // runs
-    more, more_runs = draw_lines(*about, rest, f.dtype)
-    values, runs = np.concatenate([values, more]), runs + more_runs
-    state = state.note(f"lines: {len(values)} tell half of it", more_runs)
+    if (rest := (left // 2 - runs) * FIRST_LINES // runs) > 0:
+        more, more_runs = draw_lines(*about, rest, f.dtype)
+        values, runs = np.concatenate([values, more]), runs + more_runs
+        state = state.note(f"lines: {rest} more", more_runs)
     weight = runs * of_draw / (runs * of_draw + (left - runs) * of_line)
     scale = float(np.logaddexp.reduce(state.planes.log_mass))
     return state, Lines(scale, values, weight)
@@ -92,7 +93,7 @@ def draw_half_by_lines(f: GaussianFamily, state: SearchState) -> tuple[SearchSta
 
 def add_lines(found: Estimate, lines: Lines) -> Estimate:
     """The `Estimate` that was ``found`` by draws with what ``lines`` say; UNRELIABLE where the two
-    do not agree.
+    do not agree. What it says of weights and modes is of the draws.
     """
     if math.isnan(found.log_mean) or not lines.values.mean() > 0:
         reason = "lines to the boundary and draws do not both tell a probability above 0"
@@ -100,7 +101,7 @@ def add_lines(found: Estimate, lines: Lines) -> Estimate:
     draws, answer = Answer(found.log_mean, found.relative_error), lines.answer
     ratio = math.exp(min(answer.log_mean - draws.log_mean, 700.0))
     parts = np.array([lines.weight * ratio, 1 - lines.weight])
-    log_mean = min(draws.log_mean + math.log(parts.sum()), 0.0)
+    log_mean = min(draws.log_mean + math.log(max(parts.sum(), TINY)), 0.0)
     errors = parts * [answer.relative, draws.relative] / parts.sum()
     relative = float(np.hypot(*errors))
     interval = log_normal(
@@ -114,11 +115,16 @@ def add_lines(found: Estimate, lines: Lines) -> Estimate:
         standard_error=math.exp(log_mean) * relative,
         relative_error=relative,
         interval=interval,
-        mode_intervals=np.array([interval]) if one else found.mode_intervals,
-        ess=relative**-2,
+        mode_intervals=np.array([interval]) if one else _moved(found, log_mean),
         reliable=found.reliable and not reasons,
         warnings=(*reasons, *found.warnings),
     )
+
+
+def _moved(found, log_mean):
+    """The intervals of its modes about parts of another mean."""
+    scale = math.exp(log_mean - found.log_mean)
+    return None if found.mode_intervals is None else np.minimum(scale * found.mode_intervals, 1.0)
 
 
 def _reasons(draws, lines, relative):
