@@ -180,9 +180,9 @@ def _to_their_roots(f, state, planes, end):
             break
         aim = INSIDE * depth[unknown, None] * planes.normal[unknown]
         _, g = distances(f.sim, aim.astype(f.dtype))
-        left = g[np.arange(len(unknown)), planes.moment[unknown]]
+        # where it fails before that moment a little nearer is tried
+        left = np.nan_to_num(g[np.arange(len(unknown)), planes.moment[unknown]])
         new = INSIDE * depth[unknown] + np.clip(left / planes.rate[unknown], -FARTHER, FARTHER)
-        new = np.where(np.isnan(left), depth[unknown], new)  # behind another one
         runs += len(unknown)
         far = np.abs(new - depth[unknown]) > KNOWN
         depth[unknown], unknown = new, unknown[far]
