@@ -1,5 +1,5 @@
 """Closed loops that nobody chose: ``python -m benchmarks.random_loops [--json] [--quick | --smoke]
-[--loops FROM TO] [--keys N] [--draws N] [--stress]``.
+[--loops FROM TO] [--keys N] [--draws N] [--budget N] [--stress]``.
 
 Each is drawn by its number: a linear plant of 2 to 4 states under linear feedback of 50 to 150
 steps, whose actuator clips, is limited in rate, has a dead zone or is a relay, whose controller may
@@ -241,19 +241,26 @@ def threshold_of(loop: RandomLoop, draws: int) -> float:
     return float(np.quantile(np.ravel(most), 1 - max(loop.target, LEAST_TARGET)))
 
 
-def ask(key: jax.Array, sim: jast.Simulator, stress: bool) -> tuple[jast.estimate.Estimate, float]:
+def ask(
+    key: jax.Array, sim: jast.Simulator, budget: int | None, stress: bool
+) -> tuple[jast.estimate.Estimate, float]:
     """The probability, and log p of the likeliest failure relative to the mode, NaN where none was
     asked for.
     """
     if not stress:
-        return jast.estimate.failure_probability(key, sim), math.nan
-    report = jast.stress(key, sim)
+        return jast.estimate.failure_probability(key, sim, budget), math.nan
+    report = jast.stress(key, sim, budget)
     likeliest = float(report.failures.best.reward) if len(report.failures) else math.nan
     return report.probability, likeliest
 
 
 def rows_of(
-    number: int, keys: int, threshold_draws: int, draws: int, stress: bool = False
+    number: int,
+    keys: int,
+    threshold_draws: int,
+    draws: int,
+    budget: int | None = None,
+    stress: bool = False,
 ) -> list[dict[str, Any]]:
     """The answers of ``keys`` calls, and what plain draws of as many CPU seconds would tell."""
     loop = draw_loop(number)
@@ -264,7 +271,8 @@ def rows_of(
     truth = jast.estimate.monte_carlo(jax.random.key(1000), sim, draws)
     in_a_second, rows = plain_draws(System(sim, truth.mean), 1.0), []
     for seed in range(keys):
-        (found, best), seconds, _ = timed(lambda seed=seed: ask(jax.random.key(seed), sim, stress))
+        asked = partial(ask, jax.random.key(seed), sim, budget, stress)
+        (found, best), seconds, _ = timed(asked)
         z = (found.log_mean - truth.log_mean) / math.hypot(
             found.relative_error, truth.relative_error
         )
@@ -299,6 +307,7 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--loops", nargs=2, type=int, metavar=("FROM", "TO"), help="default: 0 20")
     parser.add_argument("--keys", type=int, help="calls of a loop (default: 2)")
     parser.add_argument("--draws", type=int, help="plain draws of a truth (default: 3,000,000)")
+    parser.add_argument("--budget", type=int, help="evaluations of a call (default: jast's)")
     parser.add_argument("--stress", action="store_true", help="call jast.stress")
     args = parser.parse_args(argv)
     first, end = args.loops or size(args, (0, 20), (14, 16), (0, 1))
@@ -307,7 +316,7 @@ def main(argv: list[str] | None = None) -> None:
     say, rows = printer(args), []
     for number in range(first, end):
         for_threshold = size(args, THRESHOLD_DRAWS, THRESHOLD_DRAWS, 2**14)
-        found = rows_of(number, keys, for_threshold, draws, args.stress)
+        found = rows_of(number, keys, for_threshold, draws, args.budget, args.stress)
         for r in found:
             say(_line(r))
         rows += found

@@ -26,8 +26,9 @@ TINY = np.finfo(float).tiny
 MAX_SPREAD = 0.5
 """Relative standard deviation of lines up to which a hundred of them tell their mean: if they are
 log-normal, 3 % of it lies beyond the greatest of a hundred, and with a deviation of 2 it is 14 %.
-Of 90 calls on 30 closed loops (`benchmarks.random_loops`, 3000 evaluations), 17 had lines that
-varied more; two of these were believed, and were .52 and .56 of the truth."""
+Of 90 calls on 30 closed loops (``python -m benchmarks.random_loops --budget 3000 --loops 0 30
+--keys 3``), 17 have lines that vary more; two of these would be believed, at .52 and .56 of the
+truth."""
 MAX_ERROR = 1 / math.sqrt(diagnostics.MIN_MODE_ESS)
 """Relative standard error above which lines and draws together are not believed: that of as many
 effective draws as draws alone need."""
