@@ -25,7 +25,7 @@ import jast
 from jast import distributions as D
 from jast._src.core.episode import _rollout, play_back
 from jast._src.core.rewards import STANDARD
-from jast._src.plot.colav import zone_outline
+from jast._src.plot.colav_log import zone_outline
 from jast._src.simulators.colav import planner, tracker, vessels
 from jast._src.simulators.colav.planner import DESIRED, SPEEDS, ZONES, inside
 from jast._src.simulators.colav.tracker import Track
