@@ -16,6 +16,7 @@ import numpy as np
 
 from jast._src.core.simulator import Simulator
 from jast._src.estimate.gaussians.half_spaces import Planes
+from jast._src.estimate.gaussians.moments import FARTHER, INSIDE
 from jast._src.normal_space.moments import distances
 from jast._src.util.pytrees import index_tree
 
@@ -28,12 +29,8 @@ MORE_RUNS = 3
 """Of a line whose root is not known by then to `APART`, at most."""
 MIN_COST = ROOT_RUNS + 1
 """Runs of a line at the least: the last one corrects it."""
-INSIDE = 0.95
-"""Part of the way to the half-space where a line is first looked at: next to it, and still safe."""
 SHORT = 0.9
 """Part of the way to where a slope leads: a distance that is 0 beyond the root tells nothing."""
-FARTHEST = 2.0
-"""Standard deviations that a slope leads at most."""
 BACK = 0.5
 """Standard deviations to step back where a line fails already."""
 APART = 1e-2
@@ -43,7 +40,6 @@ NEAREST = 1e-3
 """Standard deviations to which a root is believed at the best."""
 NODES = 32
 """Places of a tail at which the share of a half-space in it is taken."""
-
 PRODUCTS = 2**22
 """Places times half-spaces that are looked at together: 32 megabytes an array."""
 
@@ -83,8 +79,7 @@ def draw_lines(
     known = _exp(log_ndtr(-root) - planes.log_mass[k]) * tail.mean(axis=1)
     place, log_q = _places_to_look_at(rng, root, error)
     failing, _ = run(place, np.arange(n))
-    log_p = -0.5 * place**2 - 0.5 * math.log(2 * math.pi)
-    weight = _exp(log_p - log_q - planes.log_mass[k])
+    weight = _exp(_log_density(place) - log_q - planes.log_mass[k])
     wrong = failing.astype(np.float64) - (place > root)
     return known + weight * _share(planes, line, place[:, None])[:, 0] * wrong, runs + n
 
@@ -94,7 +89,7 @@ def _exp(log):
     return np.exp(np.minimum(log, 200.0))
 
 
-class Search(NamedTuple):
+class Roots(NamedTuple):
     """What is known of the roots of n lines: places along them, [n] each."""
 
     place: np.ndarray
@@ -117,14 +112,14 @@ def _roots(run, depth, rate):
     """Where lines begin to fail [n], how well that is known, and what it cost in runs."""
     no = np.full(len(depth), np.nan)
     anywhere = np.full(len(depth), np.inf)
-    known = Search(INSIDE * depth, no, no, rate, -anywhere, anywhere, depth, anywhere)
+    known = Roots(INSIDE * depth, no, no, rate, -anywhere, anywhere, depth, anywhere)
     rows, cost = np.arange(len(depth)), 0
     for i in range(ROOT_RUNS + MORE_RUNS):
         if i >= ROOT_RUNS:
             rows = np.flatnonzero(known.error > APART)
         if len(rows):
             new = _nearer(index_tree(known, rows), *run(known.place[rows], rows))
-            known, cost = Search(*map(_put, known, [rows] * len(new), new)), cost + len(rows)
+            known, cost = Roots(*map(_put, known, [rows] * len(new), new)), cost + len(rows)
     return known.root, np.maximum(known.error, NEAREST), cost
 
 
@@ -136,7 +131,7 @@ def _put(a, rows, new):
 
 
 def _nearer(known, failing, g):
-    """The `Search` with one more run of each line: by the secant rule, within what is known to be
+    """The `Roots` with one more run of each line: by the secant rule, within what is known to be
     safe and to fail.
     """
     place, base, left, slope, safe, failed, *_ = known
@@ -147,7 +142,7 @@ def _nearer(known, failing, g):
         secant = (left - g) / (place - base)
     slope = np.where(tells & (np.abs(place - base) > APART) & (secant > 0), secant, slope)
     base, left = np.where(tells, place, base), np.where(tells, g, left)
-    step = np.clip(left / slope, -FARTHEST, FARTHEST)
+    step = np.clip(left / slope, -FARTHER, FARTHER)
     root = base + step
     lost = ~((root > safe) & (root < failed))
     middle = np.where(np.isfinite(failed), failed - BACK, safe + NEAREST)
@@ -156,7 +151,7 @@ def _nearer(known, failing, g):
     root = np.where(lost, middle, root)
     error = np.minimum(np.abs(root - place), np.maximum(np.abs(root - safe), np.abs(failed - root)))
     next_place = np.where(lost, root, base + np.where(step > 0, SHORT, 1.0) * step)
-    return Search(next_place, base, left, slope, safe, failed, root, error)
+    return Roots(next_place, base, left, slope, safe, failed, root, error)
 
 
 def _places_to_look_at(rng, root, error):
@@ -170,12 +165,16 @@ def _places_to_look_at(rng, root, error):
     tail = _place_of_tail(log_ndtr(-root) + np.log(rng.random(n)))
     before = root - np.abs(rng.standard_normal(n))
     place = np.select([kind < 0.5, kind < 0.75], [near, tail], before)
-    log_normal = -0.5 * math.log(2 * math.pi)
-    log_near = log_normal - 0.5 * ((place - root) / error) ** 2 - np.log(error)
-    log_tail = log_normal - 0.5 * place**2 - log_ndtr(-root)
-    log_before = log_normal - 0.5 * (place - root) ** 2 + math.log(2)
+    log_near = _log_density((place - root) / error) - np.log(error)
+    log_tail = _log_density(place) - log_ndtr(-root)
+    log_before = _log_density(place - root) + math.log(2)
     log_side = np.where(place > root, log_tail, log_before)
     return place, np.logaddexp(math.log(0.5) + log_near, math.log(0.25) + log_side)
+
+
+def _log_density(x):
+    """Of a normal number."""
+    return -0.5 * x**2 - 0.5 * math.log(2 * math.pi)
 
 
 def _place_of_tail(log_p):

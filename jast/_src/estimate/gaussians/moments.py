@@ -18,7 +18,7 @@ from jast._src.estimate.proposal_search.search_state import (
 from jast._src.normal_space.moments import cost_of_slopes, distances, slopes
 from jast._src.util.pytrees import index_tree
 
-__all__ = ["explore_moments"]
+__all__ = ["FARTHER", "INSIDE", "explore_moments"]
 
 FIRST_DRAWS = 20
 """Draws of the model, the nearest to failure of which is where linearising begins: on neither side
