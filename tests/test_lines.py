@@ -3,6 +3,7 @@ and not believed against draws that say otherwise.
 """
 
 import math
+import re
 
 import jax
 import jax.numpy as jnp
@@ -16,7 +17,7 @@ from jast._src.estimate.estimate import estimate_from_mean
 from jast._src.estimate.gaussians import lines
 from jast._src.estimate.gaussians.family import GaussianFamily
 from jast._src.estimate.gaussians.half_spaces import Planes
-from jast._src.estimate.proposal_search import final_lines
+from jast._src.estimate.proposal_search import by_proposal, final_lines
 from jast._src.estimate.proposal_search.final_lines import Lines, add_lines, draw_half_by_lines
 from jast._src.estimate.proposal_search.search_state import SearchState, search_context
 from jast.simulators import limit_state
@@ -36,7 +37,7 @@ def total(planes, values):
 def believed(planes, g, n=4000, dtype=np.float64, dimension=3):
     """(mean, standard error, runs of a line) of the probability that g <= 0."""
     sim = limit_state(g, dimension)
-    values, runs = lines.draw_lines(np.random.default_rng(0), sim, planes, n, dtype)
+    values, _, _, runs = lines.draw_lines(np.random.default_rng(0), sim, planes, n, dtype)
     assert values.shape == (n,) and np.isfinite(values).all()
     found = total(planes, values)
     return found.mean(), found.std() / n**0.5, runs / n
@@ -45,8 +46,8 @@ def believed(planes, g, n=4000, dtype=np.float64, dimension=3):
 def test_a_plane_is_told_exactly_by_each_line_in_four_runs(dtype):
     known = half_spaces(3.5)
     sim = limit_state(lambda x: 3.5 - x[0], 3)
-    values, runs = lines.draw_lines(np.random.default_rng(0), sim, known, 50, dtype)
-    assert runs == 4 * 50
+    values, _, invalid, runs = lines.draw_lines(np.random.default_rng(0), sim, known, 50, dtype)
+    assert runs == 4 * 50 and invalid == 0
     # float32: a root of 3.5 is known to 1e-6, its tail to 4e-6
     np.testing.assert_allclose(total(known, values), norm.sf(3.5), rtol=2e-5)
 
@@ -107,14 +108,36 @@ def test_a_distance_that_tells_nothing_is_bracketed():
     assert runs <= 7
 
 
-def test_nan_on_the_way_is_no_failure():
+def test_nan_on_the_way_is_no_failure_and_counted():
     def g(x):
         return jnp.where(x[0] < 2.95, jnp.nan, 3.0 - x[0])
 
-    values, _ = lines.draw_lines(
-        np.random.default_rng(0), limit_state(g, 3), half_spaces(3.0), 200, np.float64
-    )
-    assert np.isfinite(values).all()
+    sim = limit_state(g, 3)
+    drawn = lines.draw_lines(np.random.default_rng(0), sim, half_spaces(3.0), 200, np.float64)
+    assert np.isfinite(drawn.values).all()
+    # the first run of each line, short of 3, and last runs before the root
+    assert 200 < drawn.invalid < drawn.runs and drawn.if_invalid_fail.sum() > 0
+
+
+def test_invalid_episodes_that_would_add_much_if_they_failed_are_said(drawn):
+    values = np.linspace(0.9, 1.1, 100)
+    few = add_lines(drawn, Lines(math.log(1e-4), values, 0.9, 3, 0.5))
+    assert few.reliable and few.invalid == 3
+    many = add_lines(drawn, Lines(math.log(1e-4), values, 0.9, 3, 50.0))
+    assert not many.reliable and "3 episodes are invalid" in many.warnings[0]
+    assert "0.5 times" in many.warnings[0]
+
+
+def test_an_interruption_among_lines_keeps_what_they_cost(monkeypatch):
+    def interrupt(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(by_proposal, "_draw_proposal", interrupt)
+    found = jast.estimate.failure_probability(jax.random.key(0), plane(100), 1200)
+    assert f"interrupted after {found.episodes} of 1200" in found.warnings[0]
+    costs = re.findall(r"(\d+) evaluations$", "\n".join(found.history), re.MULTILINE)
+    assert found.history[-1].endswith(f" more, {costs[-1]} evaluations")
+    assert found.episodes >= sum(map(int, costs))
 
 
 @pytest.fixture
@@ -173,8 +196,9 @@ def test_lines_of_a_black_box_stay_within_its_budget():
 
 
 def test_lines_that_can_afford_no_more_are_the_first_ones(drawn, monkeypatch):
-    monkeypatch.setattr(final_lines, "draw_lines", lambda rng, sim, planes, n, dtype: (ones, 7 * n))
+    monkeypatch.setattr(final_lines, "draw_lines", lambda *_: first)
     ones = np.ones(final_lines.FIRST_LINES)
+    first = lines.LineValues(ones, 0 * ones, 0, 7 * len(ones))
     f = GaussianFamily(limit_state(lambda x: 3.5 - x[0], 3), 150, search_context(jax.random.key(0)))
     state, found = draw_half_by_lines(f, SearchState(planes=half_spaces(3.5), efficiency=0.4))
     assert len(found.values) == len(ones) and state.spent == 7 * len(ones)

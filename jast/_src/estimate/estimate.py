@@ -24,6 +24,7 @@ __all__ = [
     "estimate_from_weights",
     "flag_imprecise",
     "guaranteed_words",
+    "invalid_warnings",
     "is_doubtful",
     "times_too_few",
 ]
@@ -299,7 +300,7 @@ def estimate_from_weights(
     found = list(reasons)
     if sums.undefined:
         found.append(f"{sums.undefined} failing episodes have a weight that is NaN or infinite")
-    found += _invalid_warnings(sums.invalid, sums.invalid_first, sums.first)
+    found += invalid_warnings(sums.invalid, sums.invalid_first, sums.first)
     about |= dict(
         unseen=-math.log1p(-level) / control if control else None,
         plain=plain if plain[-1] else None,
@@ -351,7 +352,7 @@ def estimate_from_counts(
         found.append(f"no failure in {n} episodes: only the upper bounds are known")
     elif k < MIN_COUNTED_FAILURES:
         found.append(f"{k} failures are too few: only the interval is known")
-    found += _invalid_warnings(sums.invalid, sums.invalid, k)
+    found += invalid_warnings(sums.invalid, sums.invalid, k)
     interval = clopper_pearson(k, n, level)
     return estimate_from_mean(
         method,
@@ -400,8 +401,10 @@ def _mode_intervals(log_mean, modes, sizes, n, level):
     return np.array([interval(*mode) for mode in zip(modes, sizes, strict=True)])
 
 
-def _invalid_warnings(invalid, weight, failing_weight):
-    """Texts: where the episodes without a finite number would matter if they were failures."""
+def invalid_warnings(invalid: int, weight: float, failing_weight: float) -> list[str]:
+    """Texts: where so many ``invalid`` episodes would matter if they were failures, by their
+    ``weight`` beside that of those that fail.
+    """
     if not weight > MAX_INVALID_SHARE * failing_weight:
         return []
     share = f"{weight / failing_weight:.2g} times the estimate" if failing_weight else "all of it"

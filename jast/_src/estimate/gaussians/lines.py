@@ -20,7 +20,7 @@ from jast._src.estimate.gaussians.moments import FARTHER, INSIDE
 from jast._src.normal_space.moments import distances
 from jast._src.util.pytrees import index_tree
 
-__all__ = ["MIN_COST", "draw_lines"]
+__all__ = ["MIN_COST", "LineValues", "draw_lines"]
 
 ROOT_RUNS = 3
 """Of a line to find its root: after two the roots of curved boundaries are wrong by some .02 of a
@@ -44,6 +44,20 @@ PRODUCTS = 2**22
 """Places times half-spaces that are looked at together: 32 megabytes an array."""
 
 
+class LineValues(NamedTuple):
+    """What n lines say, and what they cost."""
+
+    values: np.ndarray
+    """[n] independent unbiased estimates of the probability, over that of all half-spaces together;
+    invalid episodes count as not failing
+    """
+    if_invalid_fail: np.ndarray
+    """[n] what the invalid ones among their last runs would add if they failed"""
+    invalid: int
+    """Runs with a number that is not finite"""
+    runs: int
+
+
 class Line(NamedTuple):
     """n lines. On the host."""
 
@@ -57,22 +71,22 @@ class Line(NamedTuple):
 
 def draw_lines(
     rng: np.random.Generator, sim: Simulator, planes: Planes, n: int, dtype: Any
-) -> tuple[np.ndarray, int]:
-    """[n] independent unbiased estimates of the probability, over that of all ``planes`` together,
-    and the runs that they cost.
-    """
+) -> LineValues:
+    """The `LineValues` of ``n`` lines towards ``planes``."""
     from scipy.special import log_ndtr  # here: slow to import
 
     shares = np.exp(planes.log_mass - np.logaddexp.reduce(planes.log_mass))
     k = rng.choice(len(shares), n, p=shares / shares.sum())
     normal, z = planes.normal[k], rng.standard_normal((n, planes.normal.shape[1]))
     line = Line(k, z - (z * normal).sum(axis=1, keepdims=True) * normal, normal)
+    invalid = []  # of each run
 
     def run(place, rows):
         o, g = distances(sim, (line.origin[rows] + place[:, None] * normal[rows]).astype(dtype))
+        invalid.extend(np.asarray(o.invalid))
         return np.asarray(o.failure), np.where(np.isnan(g), np.inf, g).min(axis=1)
 
-    root, error, runs = _roots(run, planes.depth[k], planes.rate[k])
+    root, error = _roots(run, planes.depth[k], planes.rate[k])
     # a place of each of as many equal parts of the tail
     parts = (np.arange(NODES) + rng.random((n, 1))) / NODES
     tail = _share(planes, line, _place_of_tail(log_ndtr(-root)[:, None] + np.log(parts)))
@@ -80,8 +94,10 @@ def draw_lines(
     place, log_q = _places_to_look_at(rng, root, error)
     failing, _ = run(place, np.arange(n))
     weight = _exp(_log_density(place) - log_q - planes.log_mass[k])
+    weight *= _share(planes, line, place[:, None])[:, 0]
     wrong = failing.astype(np.float64) - (place > root)
-    return known + weight * _share(planes, line, place[:, None])[:, 0] * wrong, runs + n
+    doubt = weight * np.array(invalid[-n:])
+    return LineValues(known + weight * wrong, doubt, sum(invalid), len(invalid))
 
 
 def _exp(log):
@@ -109,18 +125,18 @@ class Roots(NamedTuple):
 
 
 def _roots(run, depth, rate):
-    """Where lines begin to fail [n], how well that is known, and what it cost in runs."""
+    """Where lines begin to fail [n], and how well that is known [n]."""
     no = np.full(len(depth), np.nan)
     anywhere = np.full(len(depth), np.inf)
     known = Roots(INSIDE * depth, no, no, rate, -anywhere, anywhere, depth, anywhere)
-    rows, cost = np.arange(len(depth)), 0
+    rows = np.arange(len(depth))
     for i in range(ROOT_RUNS + MORE_RUNS):
         if i >= ROOT_RUNS:
             rows = np.flatnonzero(known.error > APART)
         if len(rows):
             new = _nearer(index_tree(known, rows), *run(known.place[rows], rows))
-            known, cost = Roots(*map(_put, known, [rows] * len(new), new)), cost + len(rows)
-    return known.root, np.maximum(known.error, NEAREST), cost
+            known = Roots(*map(_put, known, [rows] * len(new), new))
+    return known.root, np.maximum(known.error, NEAREST)
 
 
 def _put(a, rows, new):

@@ -267,7 +267,9 @@ def _audit(search):
     """The `Search` after the audits of its proposal."""
     f, state = search
     state = cool_failures(f, state) if isinstance(f, TiltFamily) else state
-    return Search(f, audit_proposal(f, state))
+    audited = Search(f, audit_proposal(f, state))
+    f.context.latest[:] = [audited]
+    return audited
 
 
 def _draw_moments(request, search, reasons):

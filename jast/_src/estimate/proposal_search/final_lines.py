@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from jast._src.estimate import diagnostics
-from jast._src.estimate.estimate import Estimate
+from jast._src.estimate.estimate import Estimate, invalid_warnings
 from jast._src.estimate.gaussians.family import GaussianFamily
 from jast._src.estimate.gaussians.lines import MIN_COST, draw_lines
 from jast._src.estimate.population.search import MAX_DISAGREEMENT, Answer
@@ -44,6 +44,10 @@ class Lines(NamedTuple):
     """[n] independent unbiased estimates of the probability, over exp(``log_scale``)"""
     weight: float
     """Of their mean beside that of draws, by the variances of the first of them and of batches"""
+    invalid: int = 0
+    """Runs with a number that is not finite"""
+    if_invalid_fail: float = 0.0
+    """What invalid runs would add to the sum of ``values`` if they failed"""
 
     @property
     def answer(self) -> Answer:
@@ -75,21 +79,25 @@ def draw_half_by_lines(f: GaussianFamily, state: SearchState) -> tuple[SearchSta
     if state.planes is None or left < 3 * FIRST_LINES * MIN_COST or not 0 < state.efficiency < 1:
         return state, None
     about = f.context.rng, f.sim, state.planes
-    values, runs = draw_lines(*about, FIRST_LINES, f.dtype)
+    values, if_invalid_fail, invalid, runs = draw_lines(*about, FIRST_LINES, f.dtype)
     mean, spread = float(values.mean()), float(values.var(ddof=1))
     of_line = runs / FIRST_LINES * spread / mean**2 if mean > 0 else math.inf
     of_draw = 1 / state.efficiency - 1
     text = f"lines: an evaluation has a relative variance of {of_line:.3g}, of draws {of_draw:.3g}"
     state = state.note(text, runs)
+    f.context.latest[:] = [(f, state)]
     if of_line >= of_draw or spread > MAX_SPREAD**2 * mean**2:
         return state, None
     if (rest := (left // 2 - runs) * FIRST_LINES // runs) > 0:
-        more, more_runs = draw_lines(*about, rest, f.dtype)
-        values, runs = np.concatenate([values, more]), runs + more_runs
-        state = state.note(f"lines: {rest} more", more_runs)
+        more = draw_lines(*about, rest, f.dtype)
+        values = np.concatenate([values, more.values])
+        if_invalid_fail = np.concatenate([if_invalid_fail, more.if_invalid_fail])
+        invalid, runs = invalid + more.invalid, runs + more.runs
+        state = state.note(f"lines: {rest} more", more.runs)
+        f.context.latest[:] = [(f, state)]
     weight = runs * of_draw / (runs * of_draw + (left - runs) * of_line)
     scale = float(np.logaddexp.reduce(state.planes.log_mass))
-    return state, Lines(scale, values, weight)
+    return state, Lines(scale, values, weight, invalid, float(if_invalid_fail.sum()))
 
 
 def add_lines(found: Estimate, lines: Lines) -> Estimate:
@@ -119,6 +127,7 @@ def add_lines(found: Estimate, lines: Lines) -> Estimate:
         mode_intervals=np.array([interval]) if one else _moved(found, log_mean),
         reliable=found.reliable and not reasons,
         warnings=(*reasons, *found.warnings),
+        invalid=found.invalid + lines.invalid,
     )
 
 
@@ -130,7 +139,9 @@ def _moved(found, log_mean):
 
 def _reasons(draws, lines, relative):
     """Why draws and lines together must not be believed."""
-    reasons, share = [], np.abs(lines.values).max() / lines.values.sum()
+    total = float(lines.values.sum())
+    reasons = invalid_warnings(lines.invalid, lines.if_invalid_fail, total)
+    share = np.abs(lines.values).max() / total
     if draws.apart(lines.answer) > MAX_DISAGREEMENT:
         reasons.append(
             f"lines to the boundary say {lines.answer}, draws {draws}: one of them misses a part of"
