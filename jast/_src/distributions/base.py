@@ -256,3 +256,6 @@ class Wrapped(Distribution):
     @property
     def batch_shape(self) -> tuple[int, ...]:
         return self._distribution.batch_shape
+
+    def log_prob(self, value: Any) -> jax.Array:
+        return self._distribution.log_prob(value)

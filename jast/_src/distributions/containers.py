@@ -34,63 +34,54 @@ class Independent(Distribution):
     """
 
     def __init__(self, distribution: Any, reinterpreted_batch_ndims: int | None = None) -> None:
-        self._distribution = distribution = _accepted(distribution)
-        event, n = distribution.event_shape, reinterpreted_batch_ndims
+        d = _accepted(distribution)
+        event, n = d.event_shape, reinterpreted_batch_ndims
         if not (isinstance(event, tuple) and all(isinstance(i, int) for i in event)):
             raise ValueError(
-                f"Independent: distribution: expected one of arrays, received {_name(distribution)}"
+                f"Independent: distribution: expected one of arrays, received {_name(d)}"
                 f" with event shape {event!r}; wrap its parts instead"
             )
-        ndim = len(distribution.batch_shape)
+        ndim = len(d.batch_shape)
         n = max(ndim - 1, 0) if n is None else n
         if not 0 <= n <= ndim:
             raise ValueError(
-                f"Independent: reinterpreted_batch_ndims: {_name(distribution)} has {ndim} batch"
+                f"Independent: reinterpreted_batch_ndims: {_name(d)} has {ndim} batch"
                 f" dimensions, received {n}"
             )
-        self._reinterpreted_batch_ndims = n
-
-    @property
-    def distribution(self) -> Any:
-        return self._distribution
-
-    @property
-    def reinterpreted_batch_ndims(self) -> int:
-        return self._reinterpreted_batch_ndims
+        self.distribution: Any = d
+        self.reinterpreted_batch_ndims: int = n
 
     @property
     def event_shape(self) -> Any:
-        batch = self._distribution.batch_shape
-        return (
-            batch[len(batch) - self._reinterpreted_batch_ndims :] + self._distribution.event_shape
-        )
+        batch = self.distribution.batch_shape
+        return batch[len(batch) - self.reinterpreted_batch_ndims :] + self.distribution.event_shape
 
     @property
     def batch_shape(self) -> tuple[int, ...]:
-        batch = self._distribution.batch_shape
-        return batch[: len(batch) - self._reinterpreted_batch_ndims]
+        batch = self.distribution.batch_shape
+        return batch[: len(batch) - self.reinterpreted_batch_ndims]
 
     def _sample_n(self, key: PRNGKey, n: int) -> Any:
-        return self._distribution.sample(seed=key, sample_shape=n)
+        return self.distribution.sample(seed=key, sample_shape=n)
 
     def log_prob(self, value: Any) -> Array:
-        log_p = self._distribution.log_prob(value)
-        return jnp.sum(log_p, axis=tuple(-i - 1 for i in range(self._reinterpreted_batch_ndims)))
+        log_p = self.distribution.log_prob(value)
+        return jnp.sum(log_p, axis=tuple(-i - 1 for i in range(self.reinterpreted_batch_ndims)))
 
     def mean(self) -> Any:
-        return self._distribution.mean()
+        return self.distribution.mean()
 
     def variance(self) -> Any:
-        return self._distribution.variance()
+        return self.distribution.variance()
 
     def stddev(self) -> Any:
-        return self._distribution.stddev()
+        return self.distribution.stddev()
 
     def median(self) -> Any:
-        return self._distribution.median()
+        return self.distribution.median()
 
     def mode(self) -> Any:
-        return mode(self._distribution)
+        return mode(self.distribution)
 
 
 class Joint(Distribution):
@@ -108,48 +99,44 @@ class Joint(Distribution):
     """
 
     def __init__(self, distributions: Any) -> None:
-        self._distributions = tree_map(_accepted, distributions)
-        batches = {d.batch_shape for d in leaves(self._distributions)}
+        self.distributions: Any = tree_map(_accepted, distributions)
+        batches = {d.batch_shape for d in leaves(self.distributions)}
         if len(batches) > 1:
-            each = ", ".join(f"{_name(d)} {d.batch_shape}" for d in leaves(self._distributions))
+            each = ", ".join(f"{_name(d)} {d.batch_shape}" for d in leaves(self.distributions))
             raise ValueError(
                 f"Joint: expected one batch shape, received {each}; a part that is a vector is"
                 " Independent(part, 1)"
             )
 
     @property
-    def distributions(self) -> Any:
-        return self._distributions
-
-    @property
     def event_shape(self) -> Any:
-        return tree_map(lambda d: d.event_shape, self._distributions)
+        return tree_map(lambda d: d.event_shape, self.distributions)
 
     @property
     def batch_shape(self) -> tuple[int, ...]:
-        return leaves(self._distributions)[0].batch_shape
+        return leaves(self.distributions)[0].batch_shape
 
     @property
     def dtype(self) -> Any:
-        return tree_map(lambda d: d.dtype, self._distributions)
+        return tree_map(lambda d: d.dtype, self.distributions)
 
     def _sample_n(self, key: PRNGKey, n: int) -> Any:
-        treedef = jax.tree.structure(self._distributions, is_leaf=is_distribution)
+        treedef = jax.tree.structure(self.distributions, is_leaf=is_distribution)
         keys = treedef.unflatten(list(jax.random.split(key, treedef.num_leaves)))
-        return tree_map(lambda d, k: d.sample(seed=k, sample_shape=n), self._distributions, keys)
+        return tree_map(lambda d, k: d.sample(seed=k, sample_shape=n), self.distributions, keys)
 
     def log_prob(self, value: Any) -> Array:
-        parts = tree_map(lambda d, v: d.log_prob(v), self._distributions, value)
+        parts = tree_map(lambda d, v: d.log_prob(v), self.distributions, value)
         return jnp.sum(jnp.stack(jax.tree.leaves(parts)), axis=0)
 
     def mean(self) -> Any:
-        return tree_map(lambda d: d.mean(), self._distributions)
+        return tree_map(lambda d: d.mean(), self.distributions)
 
     def median(self) -> Any:
-        return tree_map(lambda d: d.median(), self._distributions)
+        return tree_map(lambda d: d.median(), self.distributions)
 
     def mode(self) -> Any:
-        return tree_map(mode, self._distributions)
+        return tree_map(mode, self.distributions)
 
 
 def leaves(distributions: Any) -> list[Any]:

@@ -91,9 +91,6 @@ class Moved(Wrapped):
     def sample(self, *, seed, sample_shape=()):
         return self._distribution.sample(seed=seed, sample_shape=sample_shape)
 
-    def log_prob(self, value):
-        return self._distribution.log_prob(value)
-
     def mode(self):
         return x_of(self._model, self._mean)
 

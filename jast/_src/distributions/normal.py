@@ -198,7 +198,7 @@ class MultivariateNormalTri(_Vector):
         self._loc = jnp.zeros((k,), dtype) if loc is None else loc
         triangle = jnp.tril if is_lower else jnp.triu
         self._scale_tri = jnp.eye(k, dtype=dtype) if scale is None else triangle(scale)
-        self._is_lower = is_lower
+        self.is_lower: bool = is_lower
 
     @property
     def batch_shape(self) -> tuple[int, ...]:
@@ -209,10 +209,6 @@ class MultivariateNormalTri(_Vector):
         shape = self.batch_shape + 2 * self.event_shape
         return jnp.broadcast_to(self._scale_tri, shape)
 
-    @property
-    def is_lower(self) -> bool:
-        return self._is_lower
-
     def _sample_n(self, key: PRNGKey, n: int) -> Any:
         product = jnp.vectorize(lambda e, a: a @ e, signature="(k),(k,k)->(k)")
         e = self._noise.sample(seed=key, sample_shape=n)
@@ -220,7 +216,7 @@ class MultivariateNormalTri(_Vector):
 
     def log_prob(self, value: Any) -> Array:
         solve = jnp.vectorize(
-            lambda x, a: jax.scipy.linalg.solve_triangular(a, x, lower=self._is_lower),
+            lambda x, a: jax.scipy.linalg.solve_triangular(a, x, lower=self.is_lower),
             signature="(k),(k,k)->(k)",
         )
         diagonal = jnp.diagonal(self._scale_tri, axis1=-2, axis2=-1)

@@ -224,30 +224,23 @@ class MixtureSameFamily(Distribution):
                 "MixtureSameFamily: components_distribution: expected one of numbers, received"
                 f" event shape {components_distribution.event_shape}"
             )
-        self._mixture, self._components = mixture_distribution, components_distribution
-
-    @property
-    def mixture_distribution(self) -> Any:
-        return self._mixture
-
-    @property
-    def components_distribution(self) -> Any:
-        return self._components
+        self.mixture_distribution: Any = mixture_distribution
+        self.components_distribution: Any = components_distribution
 
     @property
     def batch_shape(self) -> tuple[int, ...]:
-        return self._components.batch_shape[:-1]
+        return self.components_distribution.batch_shape[:-1]
 
     def _sample_n(self, key: PRNGKey, n: int) -> Any:
         which, what = jax.random.split(key)
-        k = self._mixture.sample(seed=which, sample_shape=n)
+        k = self.mixture_distribution.sample(seed=which, sample_shape=n)
         k = k.reshape(n, *(1,) * (len(self.batch_shape) + 1 - k.ndim), *k.shape[1:])
         k = jnp.broadcast_to(k, (n, *self.batch_shape))
-        x = self._components.sample(seed=what, sample_shape=n)
+        x = self.components_distribution.sample(seed=what, sample_shape=n)
         return jnp.take_along_axis(x, k[..., None].astype(jnp.int32), axis=-1)[..., 0]
 
     def log_prob(self, value: Any) -> Array:
-        each = self._components.log_prob(jnp.asarray(value)[..., None])
+        each = self.components_distribution.log_prob(jnp.asarray(value)[..., None])
         return jax.nn.logsumexp(each + _log_weights(self), axis=-1)
 
 

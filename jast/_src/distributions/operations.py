@@ -301,10 +301,8 @@ def sum_parts(parts: ArrayTree) -> jax.Array:
     """
     leaves = jax.tree.leaves(parts)
     dtype = jnp.result_type(*leaves)
-    return sum(
-        (lax.convert_element_type(v, dtype) for v in leaves[1:]),
-        lax.convert_element_type(leaves[0], dtype),
-    )
+    first, *others = (lax.convert_element_type(v, dtype) for v in leaves)
+    return sum(others, first)
 
 
 def no_quantile(d: Any) -> ValueError:

@@ -11,7 +11,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from jast._src.core.typing import Array, PRNGKey
+from jast._src.core.typing import PRNGKey
 from jast._src.distributions import (
     continuous,
     counts,
@@ -56,9 +56,6 @@ class NumPyro(Wrapped):
 
     def _sample_n(self, key: PRNGKey, n: int) -> Any:
         return self._distribution.sample(key, (n,))
-
-    def log_prob(self, value: Any) -> Array:
-        return self._distribution.log_prob(value)
 
     def quantile(self, u: Any) -> Any:
         try:

@@ -201,42 +201,34 @@ class Where(Distribution):
     """
 
     def __init__(self, pred: Array | bool, a: DistributionLike, b: DistributionLike) -> None:
-        self._pred, self._a, self._b = jnp.asarray(pred), a, b
-
-    @property
-    def pred(self) -> jax.Array:
-        return self._pred
-
-    @property
-    def parts(self) -> tuple[Any, Any]:
-        """``(a, b)``."""
-        return self._a, self._b
+        self.pred: jax.Array = jnp.asarray(pred)
+        self.parts: tuple[Any, Any] = (a, b)
 
     @property
     def event_shape(self) -> Any:
-        return self._a.event_shape
+        return self.parts[0].event_shape
 
     def select(self, a: Any, b: Any) -> Any:
         """The pytree ``a`` where ``pred`` holds, else ``b``."""
         return jax.tree.map(
-            lambda x, y: jnp.where(self._pred, x, jnp.asarray(y, jnp.result_type(x))), a, b
+            lambda x, y: jnp.where(self.pred, x, jnp.asarray(y, jnp.result_type(x))), a, b
         )
 
     def sample(self, *, seed: PRNGKey | int, sample_shape: int | Sequence[int] = ()) -> Any:
-        seed = as_key(seed)
+        (a, b), seed = self.parts, as_key(seed)
         # one key serves both, as only one of the two draws is seen; the clone tells JAX's check of
         # reused keys that it is meant
-        other = self._b.sample(seed=jax.random.clone(seed), sample_shape=sample_shape)
-        return self.select(self._a.sample(seed=seed, sample_shape=sample_shape), other)
+        other = b.sample(seed=jax.random.clone(seed), sample_shape=sample_shape)
+        return self.select(a.sample(seed=seed, sample_shape=sample_shape), other)
 
     def log_prob(self, value: Any) -> Array:
-        return self.select(self._a.log_prob(value), self._b.log_prob(value))
+        return self.select(*(d.log_prob(value) for d in self.parts))
 
     def log_prob_from_mode(self, value: Any) -> Array:
-        return self.select(log_density(self._a, value, "mode"), log_density(self._b, value, "mode"))
+        return self.select(*(log_density(d, value, "mode") for d in self.parts))
 
     def mode(self) -> Any:
-        return self.select(mode(self._a), mode(self._b))
+        return self.select(*map(mode, self.parts))
 
 
 def tent(
