@@ -13,10 +13,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jast._src.core import black_boxes
 from jast._src.core.actions import UniformBox
-from jast._src.core.black_boxes import check_played_again, words_on_distances
 from jast._src.core.contract import action_name, arrays, called, contract, first_line, leaf_path
-from jast._src.core.lost_failures import warn_of_lost_failures
 from jast._src.core.probe import probe
 from jast._src.core.simulator import Simulator, first_state
 from jast._src.core.traps import traps
@@ -80,7 +79,7 @@ def check(sim: Simulator, actions: Actions | None = None) -> Simulator:
             f"check: while the first steps ran, a function of the simulator raised {_raised(e)}"
         ) from e
     _check_densities(found)
-    check_played_again(sim, found.x0)
+    black_boxes.check_played_again(sim, found.x0)
     _check_twice("init", sim.init, found.x0)
     _check_twice("evaluate", sim.evaluate, found.judged)
     for incident in new_incidents(before, incidents(sim)):
@@ -92,9 +91,9 @@ def check(sim: Simulator, actions: Actions | None = None) -> Simulator:
     _check_twice("step", lambda x0, x: sim.step(first_state(sim, x0), x), found.x0, found.x)
     _check_numbers(found, new_incidents(before, incidents(sim)))
     hosted = runs_on_host(sim)
-    for words in words_on_distances(sim) if hosted else traps(sim, found.resolution):
+    for words in black_boxes.words_on_distances(sim) if hosted else traps(sim, found.resolution):
         warnings.warn(f"check: {words}", UserWarning, stacklevel=2)
-    warn_of_lost_failures(sim)
+    black_boxes.warn_of_lost_failures(sim)
     share = 0.0 if actions is None else _impossible_share(sim, actions, found.x0)
     if share > 0.5:
         box = ""
