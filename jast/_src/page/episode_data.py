@@ -51,7 +51,9 @@ def trace(sim: Simulator | None, episode: Episode, quiet: Episode | None, most: 
     if sim is None:
         return found
     found["states"] = groups(whole, steps, "state")
-    found["distance"] = distances(sim, played, steps)
+    # of an episodic system it says nothing, and a black box would be called again for it
+    told = not (sim.episodic or runs_on_host(sim))
+    found["distance"] = short(np.asarray(far(sim, played), float)[steps]) if told else None
     if quiet is not None:
         there = [t for t in steps if t <= int(quiet.length)]
         calm = groups(states_of(sim, quiet), there, "state")
@@ -73,37 +75,30 @@ def _numbers(a: Any) -> np.ndarray:
     return np.zeros((len(a), 0)) if key else np.asarray(a)
 
 
-def distances(sim: Simulator, states: Any, steps: list[int]) -> list[float] | None:
-    """Miss distance at each of ``steps``; None where that says nothing, or where it would call
-    a black box again.
-    """
-    if sim.episodic or runs_on_host(sim):
-        return None
-    return short(np.asarray(far(sim, states), float)[steps])
-
-
 @jax.jit
 def far(sim: Simulator, states: Any) -> jax.Array:
     """Miss distance of each of ``states`` [n, ...]."""
     return jax.vmap(lambda s: sim.evaluate(s)[1])(states)
 
 
-def groups(tree: Any, steps: list[int], name: str, late: int = 0) -> list[dict]:
+def groups(
+    tree: Any, steps: list[int], name: str, late: int = 0, most: int = ENTRIES
+) -> list[dict]:
     """A group of columns for each array of the pytree ``tree`` [T, ...]: ``name``, the ``entries``
-    of the array that are shown, ``more``, how many are not, and ``columns``, each over ``steps``.
+    of the array that are shown, at ``most`` so many, ``more``, how many are not, and ``columns``,
+    each over ``steps``.
 
     ``late``: row 0 is of step 1, and step 0 has none.
     """
     found = []
     for called, places, flat in named_fields(tree, name):
-        shown = min(flat.shape[1], ENTRIES)
-        rows = [flat[t - late, :shown] if t >= late else np.full(shown, np.nan) for t in steps]
+        shown = np.pad(flat[:, :most], ((late, 0), (0, 0)), constant_values=np.nan)[steps]
         found.append(
             {
                 "name": called,
-                "entries": places[:ENTRIES],
-                "more": max(0, flat.shape[1] - ENTRIES),
-                "columns": [short([float(row[j]) for row in rows]) for j in range(shown)],
+                "entries": places[:most],
+                "more": max(0, len(places) - most),
+                "columns": [short(column) for column in shown.T],
             }
         )
     return found

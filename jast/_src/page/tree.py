@@ -180,13 +180,10 @@ def _data(nodes: Nodes, trees: Any, shown: np.ndarray) -> dict:
 
 
 def _actions(tree: Any, steps: list[int], name: str, wanted: np.ndarray) -> list[dict]:
-    found = groups(tree, steps, name) if len(steps) > 1 else []
+    found = groups(tree, steps, name, most=ENTRIES) if len(steps) > 1 else []
     for group in found:
-        group["more"] += max(0, len(group["entries"]) - ENTRIES)
-        group["entries"] = group["entries"][:ENTRIES]
-        columns = group["columns"][:ENTRIES]
         group["columns"] = [
             [v if there else None for v, there in zip(column, wanted, strict=True)]
-            for column in columns
+            for column in group["columns"]
         ]
     return found
