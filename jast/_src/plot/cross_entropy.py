@@ -237,19 +237,10 @@ def convergence(
     return panels
 
 
-class _Log:
-    """The evaluations of one run as NumPy arrays, without those that were not made."""
-
-    def __init__(self, history):
-        told = np.isfinite(np.asarray(history.x)).all(1)
-        self.x, self.value, self.iteration = (
-            np.asarray(a)[told] for a in (history.x, history.value, history.iteration)
-        )
-        self.best_x = np.asarray(history.best_x)
-
-
 def _log(caller, result):
-    """The `_Log` of one run in the plane, or a ValueError."""
+    """The history of one run in the plane, as NumPy arrays and without the evaluations that were
+    not made; or a ValueError.
+    """
     style.checked_kind(caller, "result", result, CEResult, "a CEResult")
     if np.ndim(result.best_value):
         raise style.wrong(
@@ -258,10 +249,11 @@ def _log(caller, result):
     if np.size(result.best_x) != 2:
         must = "be of an objective of 2 numbers"
         raise style.wrong(caller, "result", must, np.size(result.best_x))
-    log = _Log(result.history)
-    if not len(log.x):
+    log = jax.tree.map(np.asarray, result.history)
+    told = np.isfinite(log.x).all(1)
+    if not told.any():
         raise ValueError(f"plot.{caller}: result must have evaluations, received none")
-    return log
+    return log._replace(x=log.x[told], value=log.value[told], iteration=log.iteration[told])
 
 
 def _iterations(log):

@@ -162,9 +162,8 @@ def disturbance_fields(sim: Simulator | None, episode: Episode) -> list[tuple[Fi
 @jax.jit
 def _spreads(sim: Simulator, episode: Episode) -> tuple[Any, Any]:
     """How far out x0 (``()`` where the start is fixed) and each disturbance [T, ...] are."""
-    states = index_tree(replay(sim, episode).states, np.s_[:-1])
     rows = jax.tree.leaves(episode.disturbances)[0].shape[0]
-    states = index_tree(states, np.s_[:rows])
+    states = index_tree(replay(sim, episode).states, np.s_[:rows])
     steps = jax.vmap(lambda s, x: spread(sim.disturbance(s), x))(states, episode.disturbances)
     return spread(sim.start(), episode.x0) if jax.tree.leaves(episode.x0) else (), steps
 

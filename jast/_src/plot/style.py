@@ -105,14 +105,16 @@ WRITERS = {".mp4": "ffmpeg", ".gif": "pillow", ".html": "html"}
 
 
 @contextmanager
-def axes(given, size, rows=1, columns=1, *, sharex=True, sharey=False, layout="constrained"):
-    """The given axes, or those of a new figure; the style of these pictures while drawing."""
+def axes(given, size, rows=1, columns=1, **settings):
+    """The given axes, or those of a new figure with ``settings`` of `matplotlib.pyplot.subplots`;
+    the style of these pictures while drawing.
+    """
     import matplotlib.pyplot as plt
 
     with styled():
         if given is None:
-            shared = dict(sharex=sharex, sharey=sharey)
-            given = plt.subplots(rows, columns, figsize=size, layout=layout, **shared)[1]
+            settings = dict(sharex=True, layout="constrained") | settings
+            given = plt.subplots(rows, columns, figsize=size, **settings)[1]
         for each in np.ravel(np.asarray(given, object)):
             if not callable(getattr(each, "get_xlim", None)):
                 raise ValueError(f"plot: ax must be Axes of matplotlib, received {each!r:.80}")
