@@ -167,7 +167,7 @@ class Host:
         leaves [n, ...] and [n, horizon, ...].
         """
         with self.lock:
-            on_the_way, at_the_end = self.runner.judge(*map(_arrays, (x0, xs))).T
+            on_the_way, at_the_end = self.runner.judge(x0, xs).T
             n = len(on_the_way)
             self.count(episodes=n, transitions=n * self.spec.horizon)
         return int(np.sum(on_the_way & ~at_the_end))
@@ -177,7 +177,7 @@ class Host:
         [2, ...] and [2, horizon, ...].
         """
         with self.lock:
-            found, episodes, transitions = self.runner.again(*map(_arrays, (x0, xs)))
+            found, episodes, transitions = self.runner.again(x0, xs)
             self.count(episodes=episodes, transitions=transitions)
         return found
 
@@ -276,10 +276,6 @@ class Host:
                 self.differs = True
                 self.log.add("not deterministic", f"the same disturbances gave {what}", example)
                 return
-
-
-def _arrays(leaves):
-    return [np.asarray(a) for a in leaves]
 
 
 def _problems(reply, dtype):

@@ -16,7 +16,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from jast._src.core.episode import Episode, replay
+from jast._src.core.episode import Episode, replay, stacked
 from jast._src.core.signature import signature_of
 from jast._src.core.simulator import Simulator
 from jast._src.core.typing import Array, PathLike, Reward
@@ -256,7 +256,7 @@ def collect(
     archive = empty(sim)
     if rows:
         archive = Failures(
-            episodes=jax.tree.map(lambda *leaves: np.stack(leaves), *kept),
+            episodes=stacked(kept),
             counts=np.ones(len(rows), np.int32),
             tree=tree[rows],
             simulation=simulation[rows],

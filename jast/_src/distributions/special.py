@@ -105,14 +105,10 @@ class Seeds(_WithoutDensity):
     """
 
     def __init__(self, shape: Sequence[int] = ()) -> None:
-        self._shape = tuple(shape)
-
-    @property
-    def event_shape(self) -> Any:
-        return self._shape
+        self.event_shape: Any = tuple(shape)
 
     def _sample_n(self, key: PRNGKey, n: int) -> Any:
-        return jax.random.bits(key, (n, *self._shape), jnp.uint32)
+        return jax.random.bits(key, (n, *self.event_shape), jnp.uint32)
 
 
 class Tent(Distribution):

@@ -116,9 +116,8 @@ def call_settings(method: str, key: jax.Array, **given: Any) -> dict[str, Any]:
     def plain(value: Any) -> Any:
         return value if isinstance(value, str | int) else np.asarray(value).tolist()
 
-    typed = jax.dtypes.issubdtype(key.dtype, jax.dtypes.prng_key)
-    seed = jax.random.key_data(key) if typed else key
-    return dict(method=method, **jax.tree.map(plain, given), seed=plain(seed))
+    seed = plain(jax.random.key_data(key))
+    return dict(method=method, **jax.tree.map(plain, given), seed=seed)
 
 
 class Former(property):
@@ -153,8 +152,7 @@ def _by_fields(value: Any, note: str = "") -> str:
     """ "Name(field=..., ...)", wrapped, each field in few words."""
     name = type(value).__name__
     parts = [f"{field}={_words(v)}" for field, v in fields_of(value).items()]
-    head = f"{name} ({note}): " if note else f"{name}("
-    lines = [head]
+    lines = [f"{name} ({note}): " if note else f"{name}("]
     for i, part in enumerate(parts):
         part += "" if i == len(parts) - 1 else ", "
         if len(lines[-1]) + len(part) > COLUMNS:

@@ -41,10 +41,10 @@ class Network(NamedTuple):
     """``apply(params, x [..., inputs])``: of the autoencoder the reconstruction [..., inputs], of
     the adversary the logits [...]
     """
-    encode: Callable[..., Any] | None
-    """``encode(params, x [..., inputs])``: the code [..., hidden[-1]]; None of the adversary"""
-    decode: Callable[..., Any] | None
-    """``decode(params, code [..., hidden[-1]])``: [..., inputs]; None of the adversary"""
+    encode: Callable[..., Any]
+    """``encode(params, x [..., inputs])``: the code [..., hidden[-1]]; not of the adversary"""
+    decode: Callable[..., Any]
+    """``decode(params, code [..., hidden[-1]])``: [..., inputs]; not of the adversary"""
 
 
 def default_widths(inputs):
@@ -59,12 +59,7 @@ def autoencoder(inputs, hidden):
     """The `Network` of chapter 4, "Dataset Autoencoder": dense layers of ``hidden`` widths, the
     same backwards, leaky ReLU after every one, also the last.
     """
-    module = _modules()[0](inputs, hidden)
-    encode, decode = (
-        Partial(lambda params, x, method=method: module.apply(params, x, method=method))
-        for method in ("encode", "decode")
-    )
-    return Network(_init(module, inputs), Partial(module.apply), encode, decode)
+    return _network(_modules()[0](inputs, hidden), inputs)
 
 
 @functools.cache
@@ -72,13 +67,17 @@ def adversary(inputs):
     """The `Network` of chapter 4, "Adversarial Failure Classifier": inputs-128-64-1, ReLU between;
     its logits, whose sigmoid is the score.
     """
-    module = _modules()[1](ADVERSARY)
-    return Network(_init(module, inputs), Partial(module.apply), None, None)
+    return _network(_modules()[1](ADVERSARY), inputs)
 
 
-def _init(module, inputs):
-    # one program, not one a layer
-    return jax.jit(lambda key: module.init(key, jnp.zeros(inputs, jnp.float32)))
+def _network(module, inputs):
+    return Network(
+        # one program, not one a layer
+        init=jax.jit(lambda key: module.init(key, jnp.zeros(inputs, jnp.float32))),
+        apply=Partial(module.apply),
+        encode=functools.partial(module.apply, method="encode"),
+        decode=functools.partial(module.apply, method="decode"),
+    )
 
 
 def fit_autoencoder(key, rows, hidden, *, epochs=20, batch=1000, rate=1e-3):

@@ -176,11 +176,10 @@ def _run(state, selector, data, predict, budget, store, progress, callback):
     watch = Watch("validate", budget, "call", progress, callback, done=len(answered))
 
     def kept():
-        order, predicted, _ = _seen(answered, answers, data.labels)
         return state._replace(
             memory=memory,
-            order=order,
-            predicted=predicted,
+            order=np.asarray(answered, int),
+            predicted=answers.copy(),
             complete=len(seen.order),
             history=history,
             finished=finished,
