@@ -369,6 +369,22 @@ def test_what_goes_wrong_in_an_object_is_an_invalid_episode(key):
     assert any("OSError: lost" in text for text in found.warnings)
 
 
+@pytest.mark.slow
+def test_an_object_that_does_not_begin_is_an_invalid_episode(key):
+    class Picky(Walker):
+        def initialize(self, x0):
+            if x0 > 0.5:
+                raise OSError("no such start")
+            self.at = np.array([float(x0)])
+
+    sim = black_box(Picky, start=D.Normal(0.0, 0.5))
+    found = splitting(key, sim, 50, runs=6)
+    assert found.invalid > 0
+    assert any("OSError: no such start" in text for text in found.warnings)
+    (incident,) = jast.incidents.incidents(sim)
+    assert incident.x0 > 0.5 and incident.disturbances == ()
+
+
 # wrong
 
 

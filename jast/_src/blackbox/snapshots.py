@@ -114,4 +114,4 @@ class BranchingRunner(Runner):
         return thing, look
 
     def _example(self, x0, xs):
-        return fill(self.spec.x0, list(x0)), fill(self.x, list(xs))
+        return fill(self.spec.x0, list(x0)), fill(self.x, list(xs)) if xs else ()

@@ -88,7 +88,9 @@ class Incident(NamedTuple):
     example
     """
     disturbances: Any
-    """[t, ...]: the disturbances of the example up to there, a pytree where a disturbance is one"""
+    """[t, ...]: the disturbances of the example up to there, a pytree where a disturbance is one;
+    ``()`` where an object of `jast.estimate.splitting` did not begin
+    """
 
     def __str__(self) -> str:
         named = self.message.startswith(self.kind)
