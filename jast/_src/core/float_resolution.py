@@ -37,8 +37,7 @@ def describe(sim: Simulator, found: Resolution) -> str | None:
             " or the state is too coarse for it; take large offsets out of the state, or use"
             " float64"
         )
-    units = [np.nanmin(a, initial=np.inf) for a in found.units]
-    least = min(units, default=np.inf)
+    least = min((np.nanmin(a, initial=np.inf) for a in found.units), default=np.inf)
     if not least < COARSE_UNITS or not found.rounding > COARSE_SHARE * found.spread:
         return None
     return (

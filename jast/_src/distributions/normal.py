@@ -206,8 +206,7 @@ class MultivariateNormalTri(_Vector):
 
     @property
     def scale_tri(self) -> jax.Array:
-        shape = self.batch_shape + 2 * self.event_shape
-        return jnp.broadcast_to(self._scale_tri, shape)
+        return jnp.broadcast_to(self._scale_tri, self.batch_shape + 2 * self.event_shape)
 
     def _sample_n(self, key: PRNGKey, n: int) -> Any:
         product = jnp.vectorize(lambda e, a: a @ e, signature="(k),(k,k)->(k)")

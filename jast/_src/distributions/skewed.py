@@ -262,7 +262,4 @@ def _tails_cut(d, x):
     return left - log_mass, right - log_mass
 
 
-register(
-    TruncatedNormal,
-    **of_log_tails(_cut, _tails_cut),
-)
+register(TruncatedNormal, **of_log_tails(_cut, _tails_cut))

@@ -119,12 +119,10 @@ def _of_function(name: str, function: Any, above: tuple) -> Iterator[tuple[str, 
     bound, function = getattr(function, "__self__", None), getattr(function, "__func__", function)
     words = f"{getattr(function, '__module__', '')}.{function.__qualname__}"
     code = getattr(function, "__code__", None)
+    known = code is None or function in above
     ours = words.startswith(OURS)  # their versions say what they are
-    if code is None or ours or function in above:
-        yield name, words
-    else:
-        yield name, f"{words} with code {_of_code(code).hexdigest()[:12]}"
-    if code is None or function in above:
+    yield name, words if known or ours else f"{words} with code {_of_code(code).hexdigest()[:12]}"
+    if known:
         return
     held = [*enumerate(function.__defaults__ or ()), *(function.__kwdefaults__ or {}).items()]
     held += _floats_of(bound)

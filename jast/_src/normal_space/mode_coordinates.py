@@ -30,9 +30,6 @@ class Centred(Wrapped):
     def _sample_n(self, key: jax.Array, n: int) -> Any:
         return jax.vmap(lambda k: D.sample(self._distribution, k))(jax.random.split(key, n))
 
-    def log_prob(self, value: Any) -> jax.Array:
-        return self._distribution.log_prob(value)
-
     def log_prob_from_mode(self, value: Any) -> jax.Array:
         return D.log_density(self._distribution, value, "mode")
 

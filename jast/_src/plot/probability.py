@@ -39,11 +39,8 @@ def probability(
         >>> ax = jast.plot.probability({"counting": counted})
     """
     caller = "probability"
-    rows = estimates if isinstance(estimates, dict) else {None: estimates}
-    rows = {name: list(row) if isinstance(row, list) else [row] for name, row in rows.items()}
-    found = [e for row in rows.values() for e in row]
     words = "an Estimate or a dict of name -> Estimate or list of them"
-    style.checked_kinds(caller, "estimates", found, Estimate, words)
+    rows, found = style.rows_by_name(caller, "estimates", estimates, Estimate, words)
     if any(e.mean == 0 for e in found):
         raise ValueError(
             f"plot.{caller}: estimates must be above the smallest float64, received log10"
@@ -65,7 +62,7 @@ def probability(
             ax.text(1.02, y, _words(row), **beside)
         ax.set(xscale="log", xlabel="failure probability")
         ax.set(yticks=range(len(rows)), ylim=(len(rows) - 0.5, -0.5))
-        ax.set_yticklabels([e.method if name is None else name for name, (e, *_) in rows.items()])
+        ax.set_yticklabels([name or e.method for name, (e, *_) in rows.items()])
         ax.tick_params(axis="y", length=0)
         ax.grid(False, axis="y")
         handles, labels = ax.get_legend_handles_labels()

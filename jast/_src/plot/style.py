@@ -59,6 +59,7 @@ __all__ = [
     "one_episode",
     "panels",
     "plain",
+    "rows_by_name",
     "shade",
     "states_of",
     "styled",
@@ -261,6 +262,18 @@ def marker(i):
 def by_name(results):
     """A dict of name -> result; one result has the name ""."""
     return results if isinstance(results, dict) else {"": results}
+
+
+def rows_by_name(caller, name, results, kind, words):
+    """The argument ``name``, one result, a list of them or a dict of name -> either, as a dict of
+    name -> list, and all in it; ValueError as of `checked_kinds`. A result may be a tuple, so a
+    tuple is no list here.
+    """
+    rows = by_name(results)
+    rows = {key: row if isinstance(row, list) else [row] for key, row in rows.items()}
+    every = [result for row in rows.values() for result in row]
+    checked_kinds(caller, name, every if all(rows.values()) else (), kind, words)
+    return rows, every
 
 
 def named(name, words):

@@ -48,9 +48,14 @@ def failures_found(
         >>> ax = jast.plot.failures_found(found, wrong(inputs) != labels)
     """
     caller = "failures_found"
-    rows, n = _rows(caller, results)
+    words = "a jast.weakness.Result, a list of them or a dict of name -> either"
+    rows, every = style.rows_by_name(caller, "results", results, Result, words)
+    n, *others = sorted({len(result.scores) for result in every})
+    if others:
+        received = f"results of {', '.join(map(str, (n, *others)))} inputs"
+        raise style.wrong(caller, "results", "be of the same inputs", received)
     truth = None if failed is None else measures.checked_truth(f"plot.{caller}", failed, n)
-    for result in [] if truth is None else [result for row in rows.values() for result in row]:
+    for result in () if truth is None else every:
         wrong = int(np.sum(truth[result.order] != _hits(result)))
         if wrong:
             raise ValueError(
@@ -61,8 +66,7 @@ def failures_found(
         name: [np.append(0, np.cumsum(_hits(result))) for result in row]
         for name, row in rows.items()
     }
-    every = [count for row in counts.values() for count in row]
-    width, most = max(1, *(len(count) - 1 for count in every)), max(count[-1] for count in every)
+    width, most = max(1, *(result.calls for result in every)), max(r.failing for r in every)
     total = None if truth is None else int(truth.sum())
     height = 1.12 * max(total or 0, most) or 1.0
     with style.axes(ax, (7.4, 4.2)) as ax:
@@ -157,24 +161,6 @@ def roc(
 def checked_result(caller, result):
     """``result``, or a ValueError where it is none."""
     return style.checked_kind(caller, "result", result, Result, "a jast.weakness.Result")
-
-
-def _rows(caller, results):
-    """Name -> list of `Result`s, and their number of inputs, or a ValueError. A `Result` is a
-    tuple, so a tuple is no list here.
-    """
-    rows = style.by_name(results)
-    rows = {name: row if isinstance(row, list) else [row] for name, row in rows.items()}
-    every = [result for row in rows.values() for result in row]
-    words = "a jast.weakness.Result, a list of them or a dict of name -> either"
-    style.checked_kinds(caller, "results", every if all(rows.values()) else (), Result, words)
-    sizes = sorted({len(result.scores) for result in every})
-    if len(sizes) > 1:
-        raise ValueError(
-            f"plot.{caller}: results must be of the same inputs, received results of"
-            f" {', '.join(map(str, sizes))} inputs"
-        )
-    return rows, sizes[0]
 
 
 def _hits(result):
