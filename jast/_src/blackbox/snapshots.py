@@ -5,7 +5,6 @@ from __future__ import annotations
 import copy
 import time
 from collections.abc import Sequence
-from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -108,10 +107,8 @@ class BranchingRunner(Runner):
             raise
         except BaseException as error:  # SystemExit too: the system's, not ours
             thing, look = None, Look(False, np.nan, True, 0.0, np.zeros(self.size))
-            host.log.add(*said(error), partial(self._example, x0, xs))
+            example = fill(self.spec.x0, list(x0)), fill(self.x, list(xs)) if xs else ()
+            host.log.add(*said(error), lambda: example)
         with host.lock:
             host.count(calls=1, rows=1, seconds=time.perf_counter() - begun, **counts)
         return thing, look
-
-    def _example(self, x0, xs):
-        return fill(self.spec.x0, list(x0)), fill(self.x, list(xs)) if xs else ()
