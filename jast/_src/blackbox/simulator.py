@@ -173,10 +173,8 @@ def from_python(
     size = 0 if run else _observed_numbers(runner, start, limited=observe is None)
 
     if inspect.isclass(disturbance):
-        raise ValueError(
-            f"{NAME}: disturbance must be a distribution, received the class"
-            f" {disturbance.__name__}; call it, as Normal(0.0, 1.0)"
-        )
+        received = f"the class {disturbance.__name__}; call it, as Normal(0.0, 1.0)"
+        raise wrong(NAME, "disturbance", "be a distribution", received)
     constant = D.is_distribution(disturbance)
     if not (constant or callable(disturbance)):
         must = "be a distribution, or a function state -> distribution"

@@ -294,10 +294,8 @@ def merge(a: Failures, b: Failures, top: int = 64) -> Failures:
     trees = [jax.tree.structure(f.episodes) for f in (a, b)]
     shapes = [[np.shape(leaf)[1:] for leaf in jax.tree.leaves(f.episodes)] for f in (a, b)]
     if trees[0] != trees[1] or shapes[0] != shapes[1]:
-        raise ValueError(
-            "merge: both archives must be of one simulator, received episodes of shapes"
-            f" {shapes[0]} and {shapes[1]}"
-        )
+        received = f"episodes of shapes {shapes[0]} and {shapes[1]}"
+        raise wrong("merge", "both archives", "be of one simulator", received)
     arrays = join_rows(a.rows(), b.rows())
     return _best("merge", Failures(*arrays, seen=0, dropped=0), top).replace(
         seen=a.seen + b.seen, dropped=a.dropped + b.dropped

@@ -9,6 +9,7 @@ from jast._src.distributions.base import Distribution, Wrapped
 from jast._src.distributions.flat_rows import unflat
 from jast._src.distributions.operations import event_like, from_normal, mode, sample
 from jast._src.distributions.tilted import tilted
+from jast._src.util.checks import wrong
 from jast._src.util.pytrees import select
 
 __all__ = ["Blended", "Moved", "OneByOne", "blend", "x_of"]
@@ -22,10 +23,8 @@ class OneByOne(Distribution):
     def sample(self, *, seed, sample_shape=()):
         """One value; ``sample_shape`` must be ()."""
         if sample_shape != ():
-            raise ValueError(
-                f"{self.name}: sample_shape must be (), received {sample_shape!r}: use jax.vmap"
-                " over keys"
-            )
+            received = f"{sample_shape!r}: use jax.vmap over keys"
+            raise wrong(self.name, "sample_shape", "be ()", received)
         return self._draw(seed)
 
 

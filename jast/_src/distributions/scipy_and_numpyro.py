@@ -23,6 +23,7 @@ from jast._src.distributions import (
 from jast._src.distributions.base import Wrapped
 from jast._src.distributions.operations import no_quantile
 from jast._src.runtime._jax import is_traced
+from jast._src.util.checks import wrong
 
 __all__ = ["translate"]
 
@@ -79,10 +80,8 @@ def _of_scipy(d: Any) -> Any:
     for parameter in ("loc", "scale") if name == "beta" else ("loc",) if name in AT_0 else ():
         fixed = 0.0 if parameter == "loc" else 1.0
         if is_traced(given[parameter]) or np.any(given[parameter] != fixed):
-            raise ValueError(
-                f"scipy.stats.{name}: {parameter} must be {fixed:g} here, received"
-                f" {given[parameter]}: move or stretch its value in step"
-            )
+            received = f"{given[parameter]}: move or stretch its value in step"
+            raise wrong(f"scipy.stats.{name}", parameter, f"be {fixed:g} here", received)
     # plain numbers stay plain: tables serve them
     values = map(given.get, (*shapes, "loc", "scale"))
     return OF_SCIPY[name](*(v if np.ndim(v) == 0 else jnp.asarray(v) for v in values))

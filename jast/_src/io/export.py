@@ -148,10 +148,9 @@ def from_json(path: PathLike, sim: Simulator) -> Episode:
         given = json.loads(Path(path).read_text(encoding="utf-8"))
         parts = [{a["name"]: a for a in given[name]} for name in ("x0", "disturbances")]
     except (json.JSONDecodeError, UnicodeDecodeError, KeyError, TypeError) as error:
-        raise ValueError(
-            f"from_json: path must be a file from the page of a report, received {str(path)!r},"
-            f" which is not one: {error!r}"
-        ) from None
+        must = "be a file from the page of a report"
+        received = f"{str(path)!r}, which is not one: {error!r}"
+        raise wrong("from_json", "path", must, received) from None
     like, wholes = signature_of(sim), []
     for name, part in zip(("x0", "x"), parts, strict=True):
         pairs, treedef = jax.tree_util.tree_flatten_with_path(getattr(like, name))

@@ -199,10 +199,8 @@ def convergence(
             received = type(result).__name__
             if isinstance(result, CEResult):
                 received = f"leading axes {np.shape(result.best_value)}"
-            raise ValueError(
-                f"plot.{caller}: results must be CEResults with one leading axis, received"
-                f" {received}{f' for {name!r}' if name else ''}"
-            )
+            received += f" for {name!r}" if name else ""
+            raise style.wrong(caller, "results", "be CEResults with one leading axis", received)
     count = 1 if optimum is None else 2
     with style.panels(caller, axes, (5.2 * count, 3.8), count, "quantity", count) as panels:
         for i, (name, result) in enumerate(results.items()):

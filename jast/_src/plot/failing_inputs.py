@@ -73,10 +73,8 @@ def first_failures(
         raise style.wrong(caller, "inputs", must, received)
     said, true = np.asarray(result.predicted)[failures], labels[failures]
     if (same := int(np.sum(said == true))) > 0:
-        raise ValueError(
-            f"plot.{caller}: labels must be those of the result, received labels that agree with"
-            f" its answer in {same} of its {len(failures)} failures"
-        )
+        received = f"labels that agree with its answer in {same} of its {len(failures)} failures"
+        raise style.wrong(caller, "labels", "be those of the result", received)
     words = _words(caller, names, max([*said, *true], default=-1))
     tiles = failures[:count]
     count = max(len(tiles), 1)

@@ -42,10 +42,9 @@ def probability(
     words = "an Estimate or a dict of name -> Estimate or list of them"
     rows, found = style.rows_by_name(caller, "estimates", estimates, Estimate, words)
     if any(e.mean == 0 for e in found):
-        raise ValueError(
-            f"plot.{caller}: estimates must be above the smallest float64, received log10"
-            f" {min(e.log10_mean for e in found if e.mean == 0):.4g}"
-        )
+        least = min(e.log10_mean for e in found if e.mean == 0)
+        must = "be above the smallest float64"
+        raise style.wrong(caller, "estimates", must, f"log10 {least:.4g}")
     if truth is not None and not 0 < truth <= 1:
         raise ValueError(f"plot.{caller}: truth must be above 0 and at most 1, received {truth!r}")
     with style.axes(ax, (7.2, 1.3 + 0.46 * len(rows))) as ax:
@@ -104,10 +103,8 @@ def weights(traces: Traces, ax: Axes | None = None) -> Axes:
             log_w, n = np.asarray(t.log_weight, float)[np.asarray(t.failure)], len(t.failure)
             log_w = np.sort(log_w[np.isfinite(log_w)])[::-1]
             if len(log_w) < 2:
-                raise ValueError(
-                    "plot.weights: traces must hold at least 2 failures, received"
-                    f" {len(log_w)}{f' for {name!r}' if name else ''}"
-                )
+                received = f"{len(log_w)}{f' for {name!r}' if name else ''}"
+                raise style.wrong("weights", "traces", "hold at least 2 failures", received)
             k = pareto_k(log_w, n)
             w = np.exp(log_w - log_w[0])
             w, share = w * n / w.sum(), np.arange(1, len(w) + 1) / n

@@ -58,10 +58,8 @@ def failures_found(
     for result in () if truth is None else every:
         wrong = int(np.sum(truth[result.order] != _hits(result)))
         if wrong:
-            raise ValueError(
-                f"plot.{caller}: failed must agree with the results, received one that contradicts"
-                f" {wrong} of the {result.calls} calls of one"
-            )
+            received = f"one that contradicts {wrong} of the {result.calls} calls of one"
+            raise style.wrong(caller, "failed", "agree with the results", received)
     counts = {
         name: [np.append(0, np.cumsum(_hits(result))) for result in row]
         for name, row in rows.items()

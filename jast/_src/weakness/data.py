@@ -218,10 +218,8 @@ def from_idx(folder: PathLike, name: str = "t10k") -> tuple[np.ndarray, np.ndarr
         for part, dims in (("images", 3), ("labels", 1))
     )
     if len(images) != len(labels):
-        raise ValueError(
-            f"from_idx: {name} in {folder} must have a label for each image, received {len(images)}"
-            f" images and {len(labels)} labels"
-        )
+        received = f"{len(images)} images and {len(labels)} labels"
+        raise wrong("from_idx", f"{name} in {folder}", "have a label for each image", received)
     return images.astype(np.float32) / np.float32(255), labels.astype(np.int32)
 
 

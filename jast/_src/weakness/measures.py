@@ -203,10 +203,8 @@ def _check_scores(function, scores, failed):
     scores, failed = _array(scores), _array(failed)
     fits = scores.ndim == 1 and scores.shape == failed.shape
     if not fits or scores.dtype.kind not in "biuf" or failed.dtype != bool:
-        raise ValueError(
-            f"{function}: scores and failed must be [n], failed bool, received {scores.dtype} of"
-            f" shape {scores.shape} and {failed.dtype} of shape {failed.shape}"
-        )
+        received = " and ".join(f"{a.dtype} of shape {a.shape}" for a in (scores, failed))
+        raise wrong(function, "scores and failed", "be [n], failed bool", received)
     scores = scores.astype(float)
     if np.isnan(scores).any():
         raise ValueError(f"{function}: scores must not be NaN, {int(np.isnan(scores).sum())} are")

@@ -262,6 +262,10 @@ def _answers(predict, data, batch):
         f"the batch of {len(batch)} inputs"
         f" [{', '.join(map(str, batch[:4]))}{', ...' if len(batch) > 4 else ''}]"
     )
+
+    def refusal(must, received):
+        return _NoAnswer(f"predict must return {must}, received {received}, on {where}")
+
     try:
         given = predict(data.inputs[batch])
     except Exception as error:
@@ -269,24 +273,17 @@ def _answers(predict, data, batch):
     try:
         said = np.asarray(given)
     except Exception as error:
-        raise _NoAnswer(
-            f"predict must return labels [{len(batch)}], received {type(given).__name__}, on"
-            f" {where}"
-        ) from error
+        raise refusal(f"labels [{len(batch)}]", type(given).__name__) from error
     if said.shape != batch.shape or said.dtype.kind not in "iub":
         hint = ""
         if said.dtype.kind == "f":
             hint = "; give the argmax of scores" if said.ndim > 1 else "; give them as integers"
-        raise _NoAnswer(
-            f"predict must return whole numbers [{len(batch)}], received {said.dtype} of shape"
-            f" {said.shape}{hint}, on {where}"
-        )
+        received = f"{said.dtype} of shape {said.shape}{hint}"
+        raise refusal(f"whole numbers [{len(batch)}]", received)
     out = np.flatnonzero((said < 0) | (said >= data.classes))
     if len(out):
-        raise _NoAnswer(
-            f"predict must return labels in 0 ... {data.classes - 1} (classes={data.classes}),"
-            f" received {said[out[0]]} for input {batch[out[0]]}, on {where}"
-        )
+        must = f"labels in 0 ... {data.classes - 1} (classes={data.classes})"
+        raise refusal(must, f"{said[out[0]]} for input {batch[out[0]]}")
     return said.astype(np.int32)
 
 
