@@ -9,7 +9,6 @@ import hashlib
 import io
 import json
 import os
-import zipfile
 from collections.abc import Mapping
 from typing import Any
 
@@ -65,7 +64,7 @@ def read(path: PathLike, formats: Mapping[str, int], kind: str) -> tuple[Header,
     """
     check_path("load", path)
     if os.path.isdir(path):
-        raise ValueError(f"load: {path} is not {kind} but a folder, such as checkpoint= makes")
+        raise refusal(path, f"is not {kind} but a folder, such as checkpoint= makes")
     with open(path, "rb") as file:
         return unpack(file.read(), path, formats, kind)
 
@@ -75,51 +74,48 @@ def unpack(
 ) -> tuple[Header, Arrays]:
     """`read` of the bytes of a file; ``path``: what errors call it."""
     if data[:2] != b"PK":
-        raise ValueError(f"load: {path} is not {kind}")
+        raise refusal(path, f"is not {kind}")
     try:
-        with zipfile.ZipFile(io.BytesIO(data)) as pack:
-            arrays = {
-                name.removesuffix(".npy"): np.lib.format.read_array(
-                    io.BytesIO(pack.read(name)), allow_pickle=False
-                )
-                for name in pack.namelist()
-            }
+        with np.lib.npyio.NpzFile(io.BytesIO(data)) as pack:  # which takes no pickle
+            arrays = {name.removesuffix(".npy"): pack[name] for name in pack.zip.namelist()}
         header = json.loads(arrays.pop("header").tobytes()) if "header" in arrays else {}
     except Exception as error:  # a damaged zip fails in many ways
-        raise ValueError(
-            f"load: {path} is damaged or truncated ({type(error).__name__}: {error})"
-        ) from None
+        words = f"is damaged or truncated ({type(error).__name__}: {error})"
+        raise refusal(path, words) from None
     format = header.get("format") if isinstance(header, dict) else None
     if format not in formats:
-        raise ValueError(f"load: {path} is not {kind}: its format is {format!r}")
+        raise refusal(path, f"is not {kind}: its format is {format!r}")
     if header.get("version") != formats[format]:
-        raise ValueError(
-            f"load: {path} has version {header.get('version')!r}, and this jast reads version"
-            f" {formats[format]}: use the jast that wrote the file, {header.get('package')}"
-        )
+        words = f"has version {header.get('version')!r}, and this jast reads version"
+        words += f" {formats[format]}: use the jast that wrote the file, {header.get('package')}"
+        raise refusal(path, words)
     dtypes = header.get("dtypes", {})
     if set(dtypes) != set(arrays):
-        raise ValueError(
-            f"load: {path} is damaged: its list of arrays and the arrays themselves differ in"
-            f" {sorted(set(dtypes) ^ set(arrays))}"
-        )
+        unlike = sorted(set(dtypes) ^ set(arrays))
+        words = f"is damaged: its list of arrays and the arrays themselves differ in {unlike}"
+        raise refusal(path, words)
     for name, dtype in dtypes.items():
         if arrays[name].dtype.name != dtype:
             arrays[name] = arrays[name].view(jnp.dtype(dtype))
     if header.pop("sha256", None) != _checksum(header, arrays):
-        raise ValueError(f"load: {path} is damaged: its checksum does not match")
+        raise refusal(path, "is damaged: its checksum does not match")
     return header, arrays
+
+
+def refusal(path: Any, words: str) -> ValueError:
+    """The error of a file that is not taken."""
+    return ValueError(f"load: {path} {words}")
 
 
 def misfit(path: Any, other: str, words: str) -> ValueError:
     """The error where a file does not fit what was given with it."""
-    return ValueError(f"load: {path} does not fit {other}: {words}")
+    return refusal(path, f"does not fit {other}: {words}")
 
 
 def unknown(path: Any, what: str) -> ValueError:
     """The error where a file holds what only a later version writes."""
     words = "which this jast does not know: use the jast that wrote the file"
-    return ValueError(f"load: {path} {what}, {words}")
+    return refusal(path, f"{what}, {words}")
 
 
 def _entries(format: str, version: int, header: Header, arrays: Arrays) -> Arrays:
