@@ -29,7 +29,7 @@ from jast._src.runtime.host_errors import runs_on_host
 from jast._src.search.best_episodes import BestEpisodes, standard_reward
 from jast._src.search.driver import Log, require_counts, require_host, run
 from jast._src.search.go_explore.archive import Cells, empty_cells, features
-from jast._src.search.go_explore.phases import Plan, Traces, explore, improve_backward
+from jast._src.search.go_explore.phases import Plan, explore, improve_backward
 from jast._src.search.lanes import Tally, blank_episodes
 from jast._src.search.refine.final import SHARE, with_refine_share
 from jast._src.search.result import SearchResult
@@ -52,8 +52,8 @@ class State(NamedTuple):
 
     cells: Cells
     best: BestEpisodes
-    traces: Traces
-    """The failures that are made likelier."""
+    traces: Episode
+    """The failures that are made likelier, [P] in front."""
     since: int
     """The run from which on they are; -1 before it, when ``traces`` mean nothing."""
 
@@ -189,7 +189,7 @@ class _Search:
         sim, n = self.sim, self.plan.traces
         mark = jax.eval_shape(partial(features, sim), signature_of(sim).state)
         best = BestEpisodes.none(sim, max(self.top, 64), mark)
-        return State(empty_cells(sim, self.slots), best, _traces(blank_episodes(sim, n)), -1)
+        return State(empty_cells(sim, self.slots), best, blank_episodes(sim, n), -1)
 
     def step(self, state: State, begin: int, end: int) -> tuple[State, Tally, jax.Array, None]:
         """Explore, or, where a failure is known and it is time for that, make failures likelier."""
@@ -207,7 +207,7 @@ class _Search:
             )
         return State(cells, best, traces, since), tally, best.reward(), None
 
-    def first_traces(self, best: BestEpisodes) -> Traces:
+    def first_traces(self, best: BestEpisodes) -> Episode:
         """The likeliest failure, then by turns the one that ends least like those and the next
         likeliest.
         """
@@ -218,12 +218,7 @@ class _Search:
         while left and len(rows) < self.plan.traces:
             far = np.abs(mark[left][:, None] - mark[rows][None]).sum(axis=2).min(axis=1)
             rows.append(left.pop(int(np.argmax(far)) if len(rows) % 2 else 0))
-        rows = np.resize(rows, self.plan.traces)
-        return _traces(index_tree(e, rows))
+        return index_tree(e, np.resize(rows, self.plan.traces))
 
     def result(self, state: State, log: Log, settings: dict[str, Any]) -> SearchResult:
         return state.best.result(self, log, settings)
-
-
-def _traces(e: Episode) -> Traces:
-    return Traces(e.x0, e.disturbances, e.length, e.reward)

@@ -3,7 +3,7 @@ runs that go on from states of failing episodes.
 """
 
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -25,7 +25,7 @@ from jast._src.search.go_explore.continued_runs import (
 from jast._src.search.lanes import Tally, in_blocks
 from jast._src.util.pytrees import index_tree, merge_axes, select, select_rows
 
-__all__ = ["Plan", "Traces", "improve_backward", "explore"]
+__all__ = ["Plan", "improve_backward", "explore"]
 
 POINTS = 8  # states that are kept of a run at most
 FROM_START = 0.1  # share of the runs that are from the start
@@ -43,15 +43,6 @@ class Plan(NamedTuple):
     """The most steps of a run that explores."""
     traces: int
     """Failures that are made likelier side by side."""
-
-
-class Traces(NamedTuple):
-    """Failing episodes, and what is best known of each: P of them."""
-
-    x0: Any
-    rows: Any
-    length: jax.Array
-    reward: jax.Array
 
 
 @partial(jit, static_argnames="plan")
@@ -94,8 +85,9 @@ def explore(key, sim, reward, cell, plan, cells, best, begin, end):
 
 @partial(jit, static_argnames="plan")
 def improve_backward(key, sim, reward, plan, best, traces, begin, end, since, whole):
-    """Runs ``begin`` .. ``end - 1`` that go on from states of ``traces``, ever earlier ones, as
-    many as ``whole`` before they are at the start: ((`BestEpisodes`, `Traces`), `Tally`).
+    """Runs ``begin`` .. ``end - 1`` that go on from states of ``traces``, P failing episodes, ever
+    earlier ones, as many as ``whole`` before they are at the start: ((`BestEpisodes`, what is then
+    best known of each trace), `Tally`).
     """
     draw, draw_start = following_draws(sim)
     p, n = plan.traces, plan.lanes
@@ -110,7 +102,7 @@ def improve_backward(key, sim, reward, plan, best, traces, begin, end, since, wh
         first = jax.vmap(partial(start_point, sim, reward), axis_size=p)(traces.x0)
         until = jnp.maximum(back, 0)
         points, steps, _, _ = continue_runs(
-            sim, reward, keys[:p], first, until, _copied, traces.rows, sim.horizon
+            sim, reward, keys[:p], first, until, _copied, traces.disturbances, sim.horizon
         )
         mine, points, back = index_tree((traces, points, back), own_of)
         own, x0 = _ways(coins, mine, back), mine.x0
@@ -121,7 +113,7 @@ def improve_backward(key, sim, reward, plan, best, traces, begin, end, since, wh
             points = select(share >= 1, first, points)
         until = jnp.where(live, sim.horizon, 0)
         ends, new, xs, _ = continue_runs(sim, reward, keys, points, until, draw, own, sim.horizon)
-        played = played_runs(sim, reward, x0, mine.rows, points, ends, new, xs)
+        played = played_runs(sim, reward, x0, mine.disturbances, points, ends, new, xs)
         mark = jax.vmap(partial(features, sim))(ends.progress.state)
         best = best.merge(played, live, number, mark)
         more = _tally(played, new, live, number)
@@ -159,7 +151,7 @@ def _ways(u, traces, back):
     change = (u[:, 2] * len(CHANGES)).astype(jnp.int32)
     size = 10 ** (-3 * u[:, 3])
     noise = Noise(0.5 + u[:, 4], jnp.zeros_like(size))
-    of_trace = dict(rows=traces.rows, x0=traces.x0, length=traces.length)
+    of_trace = dict(rows=traces.disturbances, x0=traces.x0, length=traces.length)
     return Follow(noise=noise, **of_trace, rate=rate, change=change, size=size)
 
 
@@ -168,9 +160,7 @@ def _bettered(traces, played, live):
     p, e = traces.length.shape[0], played.episode
     value = jnp.where(e.failure & live, e.reward, -jnp.inf).reshape(-1, p)
     row = jnp.argmax(value, axis=0) * p + jnp.arange(p)
-    new = Traces(e.x0, e.disturbances, e.length, e.reward)
-    new = index_tree(new, row)
-    return select_rows(jnp.max(value, axis=0) > traces.reward, new, traces)
+    return select_rows(jnp.max(value, axis=0) > traces.reward, index_tree(e, row), traces)
 
 
 def _tally(played, new, live, number):
