@@ -4,7 +4,7 @@ observed at each of their steps; and ordinary ones.
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -24,7 +24,6 @@ from jast._src.util.checks import wrong
 from jast._src.util.pytrees import as_partial, index_tree, select_rows
 
 __all__ = [
-    "FullEpisodes",
     "distinct_rows",
     "draw_ordinary",
     "gather_episodes",
@@ -34,17 +33,6 @@ __all__ = [
 ]
 
 LANES = 256  # episodes that are played at a time
-
-
-class FullEpisodes(NamedTuple):
-    """Episodes [n] whose disturbances go on to the horizon, on the host."""
-
-    x0: Any
-    disturbances: Any
-    """[n, horizon, ...]: behind the end of an episode what the model would have drawn on."""
-    states: Any
-    """[n, horizon + 1, ...]; random keys are left out."""
-    evaluations: int
 
 
 def gather_episodes(function: str, argument: str, sim: Simulator, given: Any) -> Episode:
@@ -107,8 +95,11 @@ def named_kinds(function: str, labels: Any, n: int) -> tuple[tuple[str, ...], np
     return tuple(names.tolist()), at
 
 
-def play_to_horizon(sim: Simulator, e: Episode, key: jax.Array, states: bool) -> FullEpisodes:
-    """The episodes [n] of `gather_episodes`, whose disturbances go on.
+def play_to_horizon(
+    sim: Simulator, e: Episode, key: jax.Array, states: bool
+) -> tuple[Episode, int]:
+    """The episodes [n] of `gather_episodes`, whose disturbances go on to the horizon, with their
+    states but for random keys; and how many were played for it. On the host.
 
     A failing episode is over sooner than others; what would have come is drawn from the model at
     its last state. So no number tells that an episode was over.
@@ -119,10 +110,10 @@ def play_to_horizon(sim: Simulator, e: Episode, key: jax.Array, states: bool) ->
     """
     n = len(e.length)
     if not states and (e.length == sim.horizon).all():
-        return FullEpisodes(x0=e.x0, disturbances=e.disturbances, states=None, evaluations=0)
+        return e, 0
     rows = np.arange(n, dtype=np.int32), e.x0, e.disturbances, e.length
     x, s = side_by_side(sim, partial(_played_on, sim, key), *rows, lanes=LANES)
-    return FullEpisodes(x0=e.x0, disturbances=x, states=s, evaluations=n)
+    return e._replace(disturbances=x, states=s), n
 
 
 @jit

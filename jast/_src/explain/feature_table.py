@@ -6,9 +6,9 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
+from jast._src.core.episode import Episode
 from jast._src.core.signature import signature_of
 from jast._src.core.simulator import Simulator
-from jast._src.explain.episodes import FullEpisodes
 from jast._src.normal_space.episode_point import names_of_leaves
 from jast._src.util.leaf_names import named_numbers
 
@@ -39,7 +39,7 @@ class Describer(NamedTuple):
     lead: int
 
 
-def make_describer(sim: Simulator, episodes: FullEpisodes, of: str, lead: int) -> Describer:
+def make_describer(sim: Simulator, episodes: Episode, of: str, lead: int) -> Describer:
     """The `Describer` for episodes like these."""
     kinds = {}
     components = _components(sim, episodes)
@@ -54,7 +54,7 @@ def make_describer(sim: Simulator, episodes: FullEpisodes, of: str, lead: int) -
 
 
 def feature_table(
-    sim: Simulator, d: Describer, episodes: FullEpisodes, end: np.ndarray
+    sim: Simulator, d: Describer, episodes: Episode, end: np.ndarray
 ) -> tuple[list[Feature], np.ndarray]:
     """The features [F] of ``episodes`` [n], and their values [n, F].
 
@@ -79,7 +79,7 @@ def feature_table(
     return [f for f, _ in found], np.stack([np.asarray(v, np.float32) for _, v in found], axis=1)
 
 
-def _components(sim: Simulator, episodes: FullEpisodes) -> list[tuple[str, np.ndarray]]:
+def _components(sim: Simulator, episodes: Episode) -> list[tuple[str, np.ndarray]]:
     """(name, values [n, horizon]) of each number of a disturbance."""
     named = iter(names_of_leaves(signature_of(sim).x, "x"))
     leaves = map(np.asarray, jax.tree.leaves(episodes.disturbances))

@@ -89,7 +89,7 @@ class Rules(NamedTuple):
         """
         e = gather_episodes("predict", "episodes", self.sim, episodes)
         key = jax.random.key(1)
-        seen = play_to_horizon(self.sim, e, key, self.describer.of != "disturbances")
+        seen, _ = play_to_horizon(self.sim, e, key, self.describer.of != "disturbances")
         ends = _ends(numpy_generator(key), e, self.ends)
         _, x = feature_table(self.sim, self.describer, seen, ends)
         return np.asarray(self.classes)[self.tree.predict(x)]
@@ -183,7 +183,7 @@ def rules(
     else:
         cases = given_cases(name, sim, failures, others, labels, DISTINCT)
     e, owner, group, names, spent = cases[:5]
-    seen = play_to_horizon(sim, e, second, of != "disturbances")
+    seen, played = play_to_horizon(sim, e, second, of != "disturbances")
     rng = numpy_generator(third)
     ends = e.length[owner > 0]
     d = make_describer(sim, seen, of, lead)
@@ -208,7 +208,7 @@ def rules(
         describer=d,
         ends=ends,
         sim=sim,
-        evaluations=spent + seen.evaluations,
+        evaluations=spent + played,
         settings=display.call_settings(name, key, **settings),
     )
 
