@@ -75,6 +75,35 @@ def push(
     """
     left, before, after = iter(given), iter(memories), []
 
+    def window(f: Formula, sign: int) -> jax.Array:
+        """The bound of one window, whose next memory is put down. ``always`` is minus the
+        ``eventually`` of minus what it is of.
+        """
+        memory, news = next(before), [next(left) for _ in predicates(f)]
+        known, ahead = len(news[0]), _ahead(f, dt, total)
+        block = tuple(map(lambda *a: jnp.concatenate(a), memory.recent, news))
+        first, last = (0, 0) if isinstance(f, Predicate) else samples_in("specs", f, dt)
+        last = total - 1 if last is None else min(last, total - 1)
+        at = start - ahead + jnp.arange(ahead + known, dtype=jnp.int32)
+        now = start + known - 1
+
+        parts, inside = _parts(f), iter(block)
+        of = [values(p, inside, dt, unknown, sign=sign).own for p in parts]
+        turn = -1 if isinstance(f, Temporal) and f.kind == "always" else 1
+        inf = jnp.asarray(jnp.inf, of[0].dtype)
+        right = turn * of[-1]
+        held = jnp.where(at >= 0, of[0], inf) if len(parts) == 2 else jnp.full_like(right, jnp.inf)
+        held = jnp.minimum(lax.cummin(held), memory.held)
+        reached = jnp.minimum(right, held)
+        reached = jnp.where((at >= first) & (at <= last), reached, -inf)
+        best = jnp.maximum(memory.best, jnp.max(reached[:known]))
+        most = jnp.maximum(best, jnp.max(reached[known:], initial=-jnp.inf))
+        # moments to come: anything, that is as good for ``sign`` as can be
+        if sign * turn > 0:
+            most = jnp.where(unknown & (now < last), jnp.maximum(most, held[-1]), most)
+        after.append(Memory(best, held[known - 1], tuple(a[known:] for a in block)))
+        return turn * most
+
     def bound(f: Formula, sign: int) -> jax.Array:
         """The greatest that ``sign`` times the robustness of ``f`` can be, times ``sign``."""
         if isinstance(f, Not):
@@ -84,51 +113,10 @@ def push(
         if isinstance(f, Junction):
             op = jnp.minimum if f.kind == "&" else jnp.maximum
             return functools.reduce(op, [bound(part, sign) for part in f.parts])
-        news = tuple(next(left) for _ in predicates(f))
-        memory, found = _push_window(f, sign, next(before), news, start, unknown, dt, total)
-        after.append(memory)
-        return found
+        return window(f, sign)
 
     found = bound(formula, 1)
     return tuple(after), found
-
-
-def _push_window(
-    f: Formula,
-    sign: int,
-    memory: Memory,
-    news: tuple[jax.Array, ...],
-    start: Any,
-    unknown: Any,
-    dt: float,
-    total: int,
-) -> tuple[Memory, jax.Array]:
-    """The memory of one window after the margins ``news``, and its bound. ``always`` is minus
-    the ``eventually`` of minus what it is of.
-    """
-    known, ahead = len(news[0]), _ahead(f, dt, total)
-    block = tuple(map(lambda *a: jnp.concatenate(a), memory.recent, news))
-    first, last = (0, 0) if isinstance(f, Predicate) else samples_in("specs", f, dt)
-    last = total - 1 if last is None else min(last, total - 1)
-    at = start - ahead + jnp.arange(ahead + known, dtype=jnp.int32)
-    now = start + known - 1
-
-    parts, given = _parts(f), iter(block)
-    of = [values(p, given, dt, unknown, sign=sign).own for p in parts]
-    turn = -1 if isinstance(f, Temporal) and f.kind == "always" else 1
-    inf = jnp.asarray(jnp.inf, of[0].dtype)
-    right = turn * of[-1]
-    held = jnp.where(at >= 0, of[0], inf) if len(parts) == 2 else jnp.full_like(right, jnp.inf)
-    held = jnp.minimum(lax.cummin(held), memory.held)
-    reached = jnp.minimum(right, held)
-    reached = jnp.where((at >= first) & (at <= last), reached, -inf)
-    best = jnp.maximum(memory.best, jnp.max(reached[:known]))
-    bound = jnp.maximum(best, jnp.max(reached[known:], initial=-jnp.inf))
-    # moments to come: anything, that is as good for ``sign`` as can be
-    if sign * turn > 0:
-        bound = jnp.where(unknown & (now < last), jnp.maximum(bound, held[-1]), bound)
-    recent = tuple(a[known:] for a in block)
-    return Memory(best, held[known - 1], recent), turn * bound
 
 
 def _windows(f: Formula) -> list[Formula]:
