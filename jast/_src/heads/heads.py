@@ -12,8 +12,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jast import distributions as D
 from jast._src.core.simulator import Simulator
 from jast._src.core.typing import Array
+from jast._src.distributions.flat_rows import unflat
 from jast._src.heads.networks import Head
 from jast._src.util import display
 from jast._src.util.pytrees import as_partial
@@ -21,10 +23,10 @@ from jast._src.util.pytrees import as_partial
 __all__ = [
     "Heads",
     "Moments",
+    "draw_by_bins",
     "observation",
     "policy_logits",
     "predicted_value",
-    "sample_bins",
     "update_moments",
 ]
 
@@ -152,6 +154,13 @@ def sample_bins(logits: jax.Array, u: jax.Array) -> jax.Array:
     # of 1, so far that no rounding leads into the next bin
     inside = jnp.clip((u - beneath) / jnp.maximum(own, 1e-12), 0, 1 - bins * 2.0**-22)
     return (bin + inside) / bins
+
+
+def draw_by_bins(key: jax.Array, logits: jax.Array, actions: Any, dist: Any) -> Any:
+    """A disturbance at a point of the unit cube (`jast.actions`) that `sample_bins` draws."""
+    event = D.event_like(dist)
+    u = sample_bins(logits, jax.random.uniform(key, logits.shape[:1], jnp.float32))
+    return jax.tree.map(lambda a, s: a.astype(s.dtype), actions.at(unflat(u, event), dist), event)
 
 
 def predicted_value(heads: Heads, seen: jax.Array, x: jax.Array) -> jax.Array:

@@ -13,9 +13,9 @@ from jast._src.core.policy import Policy
 from jast._src.core.signature import signature_of
 from jast._src.core.simulator import Simulator
 from jast._src.core.typing import Actions, Numeric
-from jast._src.distributions.flat_rows import flat, unflat
+from jast._src.distributions.flat_rows import flat
 from jast._src.distributions.mixtures import OneByOne
-from jast._src.heads.heads import Heads, observation, policy_logits, sample_bins
+from jast._src.heads.heads import Heads, draw_by_bins, observation, policy_logits
 from jast._src.heads.samples import cells
 
 __all__ = ["as_policy"]
@@ -34,11 +34,7 @@ class Histogram(OneByOne):
         return jax.tree.map(lambda s: s.shape, D.event_like(self._dist))
 
     def _draw(self, key):
-        u = sample_bins(self._logits, jax.random.uniform(key, self._logits.shape[:1], jnp.float32))
-        event = D.event_like(self._dist)
-        return jax.tree.map(
-            lambda a, s: a.astype(s.dtype), self._actions.at(unflat(u, event), self._dist), event
-        )
+        return draw_by_bins(key, self._logits, self._actions, self._dist)
 
     def log_prob(self, value):
         """Log density; floating disturbances only, since a cell need not hold whole integers."""

@@ -8,9 +8,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jast import distributions as D
-from jast._src.distributions.flat_rows import flat, unflat
-from jast._src.heads.heads import Heads, observation, policy_logits, predicted_value, sample_bins
+from jast._src.distributions.flat_rows import flat
+from jast._src.heads.heads import Heads, draw_by_bins, observation, policy_logits, predicted_value
 from jast._src.util.pytrees import select
 
 __all__ = ["Guide", "child_value", "guide", "rolled"]
@@ -64,10 +63,7 @@ def rolled(guide, sim, actions, simulation, key, level, state, dist, otherwise):
     """
     logits = guide.power * policy_logits(guide.heads, observation(sim, state))
     own = jax.random.uniform(jax.random.fold_in(simulation, _SHARE), (), jnp.float32) < guide.share
-    key = jax.random.fold_in(key, _HEAD)
-    u = jax.random.uniform(key, logits.shape[:1], jnp.float32)
-    x = actions.at(unflat(sample_bins(logits, u), D.event_like(dist)), dist)
-    x = jax.tree.map(lambda a, b: a.astype(b.dtype), x, otherwise)
+    x = draw_by_bins(jax.random.fold_in(key, _HEAD), logits, actions, dist)
     return select(own & (level < guide.levels), x, otherwise)
 
 
