@@ -322,7 +322,6 @@ def test_samples_of_edges():
     edges = Edges(
         f(7, 3, 2),
         f(7, 3, 1),
-        rng.integers(0, 5, (7, 3)),
         f(7, 3),
         f(7, 3),
         rng.random((7, 3)) < 0.7,

@@ -505,7 +505,6 @@ def test_edges_are_those_of_the_tree(name, candidates):
         assert (np.flatnonzero(edges.valid[:, lane]) + 1).tolist() == taught and len(taught) > 50
         rows = np.array(taught) - 1
         seen, x = edges_there(p, tree, lane, [edge[new][:2] for new in taught])
-        np.testing.assert_array_equal(edges.visits[rows, lane], [edge[new][2] for new in taught])
         tolerance = dict(rtol=1e-5, atol=1e-4)
         np.testing.assert_allclose(edges.q[rows, lane], [q[new] for new in taught], **tolerance)
         np.testing.assert_allclose(

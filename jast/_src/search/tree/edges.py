@@ -30,8 +30,6 @@ class Edges(NamedTuple):
     """[S, B, n] what networks see of s."""
     x: jax.Array
     """[S, B, d] the disturbance."""
-    visits: jax.Array
-    """[S, B] N(s, a)."""
     q: jax.Array
     """[S, B] Q(s, a)."""
     parent_q: jax.Array
@@ -44,7 +42,7 @@ def edges_of(problem, tree, children, axes=None):
     """The `Edges` of trees that keep states at every node; ``children``: the greatest number of a
     node.
     """
-    node, _, visits, q, valid = _numbers(problem, tree, children)
+    node, _, _, q, valid = _numbers(problem, tree, children)
     parent, slot = node.parent[1:], node.slot[1:]
     parent_q = jnp.take_along_axis(jnp.concatenate([jnp.zeros_like(q[:1]), q]), parent, axis=0)
 
@@ -64,7 +62,7 @@ def edges_of(problem, tree, children, axes=None):
     )
     if signature_of(problem.sim).random_start:  # the first level chooses x0
         valid = valid & (parent > 0)
-    return Edges(seen, x, visits.astype(jnp.int32), q, parent_q, valid)
+    return Edges(seen, x, q, parent_q, valid)
 
 
 @display.printable()
