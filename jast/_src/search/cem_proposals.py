@@ -54,15 +54,14 @@ def make_draw(kind, actions, anew):
     """``(key, row, distribution) -> disturbance``, the row being z, or a pair of `copy_steps`;
     ``anew(key, distribution)`` draws where there is nothing to copy.
     """
-
-    def latent(key, z, dist):
-        return disturbance_at(actions, dist, z)
+    if kind == "latent":
+        return lambda key, z, dist: disturbance_at(actions, dist, z)
 
     def copied(key, row, dist):
         value, use = row
         return select(use, value, anew(key, dist))
 
-    return latent if kind == "latent" else copied
+    return copied
 
 
 def latents_around(sim, actions, failures, settings):

@@ -158,10 +158,8 @@ class _Search:
         o = jax.device_get(_outcomes(self.sim, lanes.astype(normal_numbers(self.sim))))
         o = index_tree(o, np.s_[:n])
         score = np.where(o.invalid, np.inf, np.where(o.failure, -1, o.distance))
-        new = Pool(score, rows, first, o.length)
-        pool = join_rows(pool, new)
-        best = np.argsort(pool.score, kind="stable")[:POOL]
-        pool = index_tree(pool, best)
+        pool = join_rows(pool, Pool(score, rows, first, o.length))
+        pool = index_tree(pool, np.argsort(pool.score, kind="stable")[:POOL])
         failing = np.flatnonzero(o.failure)
         tally = Tally(
             episodes=n,
@@ -182,8 +180,7 @@ class _Search:
         normal = map_in_lanes(LANES, _normal, u.astype(normal_numbers(self.sim)))
         e = played(self.sim, normal)
         failing = index_tree(e, np.s_[: len(numbers)])
-        nearest = index_tree(e, 0)
-        return finish(self, log, nearest, failing, numbers, settings=settings)
+        return finish(self, log, index_tree(e, 0), failing, numbers, settings=settings)
 
 
 @jit

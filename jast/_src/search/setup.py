@@ -2,7 +2,7 @@
 told, and named for the result.
 """
 
-from dataclasses import fields, is_dataclass, replace
+from dataclasses import is_dataclass, replace
 from typing import Any
 
 import jax
@@ -16,6 +16,7 @@ from jast._src.runtime._jax import is_traced, is_tracing
 from jast._src.search.calibration import Calibration, calibrate
 from jast._src.util.checks import check_random_key
 from jast._src.util.display import call_settings
+from jast._src.util.pytrees import fields_of
 
 __all__ = ["default_actions", "prepare"]
 
@@ -94,7 +95,7 @@ def _scaled(
 def _settings(part: Any) -> dict[str, Any]:
     """The numbers and texts of a reward or of actions, as JSON can hold them."""
     if is_dataclass(part):
-        given = {f.name: getattr(part, f.name) for f in fields(part)}
+        given = fields_of(part)
     else:
         args = getattr(part, "args", ())
         given = dict(getattr(part, "keywords", {})) | ({"args": args} if args else {})

@@ -8,7 +8,7 @@ import jax
 import numpy as np
 
 from jast._src.core.counter_prng import numpy_generator
-from jast._src.core.episode import Episode, replay
+from jast._src.core.episode import Episode, replay, stacked
 from jast._src.core.failures import Failures, collect, empty
 from jast._src.core.rewards import likelihood
 from jast._src.core.signature import signature_of
@@ -323,9 +323,9 @@ class _Refinement:
                     break
         found, i = empty(self.sim), np.zeros(0, np.int64)
         if failing:
-            episodes = jax.tree.map(lambda *a: np.stack(a), *failing.values())
             which = np.array(list(failing))
-            found = collect(self.sim, reward, episodes, simulation=which, top=len(which))
+            each = stacked(failing.values())
+            found = collect(self.sim, reward, each, simulation=which, top=len(which))
             i = found.simulation
         told = (a[i] for a in (origin, residual, gain, late))
         return Refined(found, *told, self.spent, self.invalid, settings)

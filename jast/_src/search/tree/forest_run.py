@@ -184,8 +184,7 @@ def plan(
         chosen = chosen | dict(focus=getattr(actions, "focus", 1.0))
     asked = dict(trees=trees, simulations=simulations, exploration=exploration) | chosen
     asked["widening"] = list(chosen["widening"])
-    prepared = prepare(method, key, sim, reward, actions, **asked)
-    reward, actions, settings, calibration = prepared
+    reward, actions, settings, calibration = prepare(method, key, sim, reward, actions, **asked)
     prunes = min(counts["prunes"], levels(sim))  # a tree of so many roots is at an episode's end
     total = prunes * simulations
     if total >= 2**24:

@@ -34,7 +34,7 @@ def unpack(words, like):
     leaves, treedef = jax.tree.flatten(like)
     out, at = [], 0
     for s in leaves:
-        n = math.prod(s.shape) * max(1, s.dtype.itemsize // 4)
+        n = width(s)
         out.append(_value(words[at : at + n], s.dtype).reshape(s.shape))
         at += n
     return treedef.unflatten(out)
