@@ -18,7 +18,7 @@ import numpy as np
 from jax.tree_util import Partial
 
 from jast import distributions as D
-from jast._src.adapters.noise import Random, disturbed, model_of, random, replaced
+from jast._src.adapters.noise import Random, add, model_of, random, replaced
 from jast._src.adapters.state_arrays import as_numbers, free_to_move, in_dtypes_of, with_keys
 from jast._src.core.contract import OBSERVED
 from jast._src.core.simulator import Simulator, fixed, ravel
@@ -217,7 +217,9 @@ def _step(loop: _Loop, now: Instant, x: Any) -> Instant:
     def changed(place: str, it: Any) -> Any:
         if place not in loop.noise:
             return it
-        return disturbed(f"{loop.name}: {place}", loop.noise[place], it, x[place])
+        if (apply := loop.noise[place].apply) is None:
+            return add(f"{loop.name}: {place}", it, x[place])
+        return apply(it, x[place])
 
     action = changed("action", loop.policy(changed("observation", now.observation)))
     own = jax.random.fold_in(jax.random.key(now.seed), now.time + 1)

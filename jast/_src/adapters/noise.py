@@ -12,7 +12,7 @@ from jast._src.core.typing import DistributionLike
 from jast._src.util.checks import wrong
 from jast._src.util.pytrees import as_partial
 
-__all__ = ["Random", "add", "disturbed", "model_of", "random", "replaced"]
+__all__ = ["Random", "add", "model_of", "random", "replaced"]
 
 PAIR = "a pair (distribution, function (it, draw) -> it)"
 
@@ -48,15 +48,10 @@ def random(
     return Random(model, None if apply is None else as_partial(apply))
 
 
-def disturbed(argument: str, random: Random, subject: Any, draw: Any) -> Any:
-    """``subject`` after the ``draw``; ``argument``: of a door, for messages."""
-    if random.apply is None:
-        return add(argument, subject, draw)
-    return random.apply(subject, draw)
-
-
 def add(argument: str, subject: Any, draw: Any) -> Any:
-    """``draw`` added to ``subject``, number by number; ValueError where their shapes differ."""
+    """``draw`` added to ``subject``, number by number; ValueError where their shapes differ, in the
+    name of the ``argument`` of a door.
+    """
     numbers, tree = jax.tree.flatten(subject)
     draws, given = jax.tree.flatten(draw)
     if tree != given:
