@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from typing import Any, NamedTuple
 
-import jax
 import numpy as np
 
 from jast._src.core.counter_prng import numpy_generator
@@ -172,8 +171,7 @@ def eigenfailures(
     played = transform.played(sim, np.concatenate([mean[None], mean - moves, mean + moves]))
     k = len(order)
     middle, minus, plus = (
-        jax.tree.map(lambda a, rows=rows: np.asarray(a)[rows], played)
-        for rows in (0, slice(1, k + 1), slice(k + 1, None))
+        index_tree(played, rows) for rows in (0, slice(1, k + 1), slice(k + 1, None))
     )
     return Eigenfailures(
         directions=vectors,

@@ -21,6 +21,7 @@ from jast._src.explain.estimate_draws import UNRELIABLE, normalised
 from jast._src.normal_space import transform
 from jast._src.util import checks, display
 from jast._src.util.intervals import checked_level
+from jast._src.util.leaf_names import entry_places
 from jast._src.util.pytrees import index_tree
 
 __all__ = ["Sensitivity", "sensitivity"]
@@ -177,9 +178,8 @@ def _parameters(sim: Simulator) -> tuple[list, np.ndarray]:
             root = str(getattr(path[0], "key", path[0]))
             # a Partial holds its arguments, then those by name
             rest = jax.tree_util.keystr(path[2:]) or jax.tree_util.keystr(path[1:])
-            for at in np.ndindex(leaf.shape):
-                called.append(f"{root}{rest}{list(at) if leaf.shape else ''}")
-                values.append(float(leaf[at]))
+            called += [root + rest + place for place in entry_places(leaf.shape)]
+            values += np.ravel(leaf).astype(float).tolist()
     return called, np.asarray(values)
 
 
