@@ -911,7 +911,7 @@ def _read(start, commands, delays):
     adversary at the same times.
     """
     dt = STEP / SUBSTEPS
-    now = lambda a: Track(a.pose.n, a.pose.e, *vessels.world_velocity(a.pose, a.velocity))
+    now = lambda a: Track(a.pose.n, a.pose.e, *vessels.pose_rate(a.pose, a.velocity)[:2])
     zero = jnp.zeros((), start.dtype)
     first = Adversary(Pose(*start), Velocity(commands[0, 0], commands[0, 1], zero))
 

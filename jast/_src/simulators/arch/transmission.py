@@ -65,10 +65,7 @@ def _evenly_spaced(step: float, at: Any, values: Any) -> np.ndarray:
     multiples of ``step``, from the first on.
     """
     grid = np.arange(round((at[-1] - at[0]) / step) + 1) * step + at[0]
-    columns = values.reshape(len(at), -1).T
-    return np.stack([np.interp(grid, at, c) for c in columns], axis=1).reshape(
-        len(grid), *values.shape[1:]
-    )
+    return np.apply_along_axis(lambda column: np.interp(grid, at, column), 0, values)
 
 
 _TABLES = read("transmission.json")

@@ -311,8 +311,7 @@ def _observe(s):
 
 def _seen(adversary):
     """The adversary's true `Track`."""
-    pose, velocity = adversary
-    return Track(pose.n, pose.e, *vessels.world_velocity(pose, velocity))
+    return Track(*adversary.pose[:2], *vessels.pose_rate(*adversary)[:2])
 
 
 def _apart(a, b):

@@ -24,7 +24,7 @@ __all__ = [
     "Velocity",
     "adversary_substep",
     "ferry_substep",
-    "world_velocity",
+    "pose_rate",
 ]
 
 MASS = (2389.657, 2533.911, 5068.910)  # kg, kg, kg m^2
@@ -83,12 +83,6 @@ def pose_rate(pose, velocity):
     """d pose / dt: the body's velocity turned into the frame."""
     c, s = jnp.cos(pose.psi), jnp.sin(pose.psi)
     return Pose(c * velocity.u - s * velocity.v, s * velocity.u + c * velocity.v, velocity.r)
-
-
-def world_velocity(pose, velocity):
-    """(north, east) velocity, m/s."""
-    rate = pose_rate(pose, velocity)
-    return rate.n, rate.e
 
 
 def forces(control, pose, velocity):
