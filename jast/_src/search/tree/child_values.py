@@ -6,7 +6,8 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from jast._src.search.tree.head_guidance import child_value
+from jast._src.distributions.flat_rows import flat
+from jast._src.heads.heads import observation, predicted_value
 from jast._src.search.tree.layout import choose_child, node_keys, nodes_of, of_lanes
 from jast._src.search.tree.pages import LINK, PAGE, ROW
 
@@ -80,5 +81,7 @@ def evaluate_children(problem, axes, tree, walk, fresh, replay, memoize):
 
 
 def _value(problem, node_key, slot, state):
+    """v(s, a); 0 where it is not finite."""
     _, x = choose_child(problem, node_key, slot, state)
-    return child_value(problem.guide, problem.sim, state, x)
+    v = predicted_value(problem.guide.heads, observation(problem.sim, state), flat(x))
+    return jnp.where(jnp.isfinite(v), v, 0)

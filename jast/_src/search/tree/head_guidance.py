@@ -1,5 +1,5 @@
-"""How a search uses its heads: rollout steps drawn from the policy head's histogram, and the value
-term of eq. 3.
+"""How a search uses its heads: what they count for, and rollout steps drawn from the policy head's
+histogram.
 """
 
 from dataclasses import dataclass, field
@@ -8,11 +8,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jast._src.distributions.flat_rows import flat
-from jast._src.heads.heads import Heads, draw_by_bins, observation, policy_logits, predicted_value
+from jast._src.heads.heads import Heads, draw_by_bins, observation, policy_logits
 from jast._src.util.pytrees import select
 
-__all__ = ["Guide", "child_value", "guide", "rolled"]
+__all__ = ["Guide", "guide", "rolled"]
 
 
 _SHARE = np.uint32(1 << 31)  # address apart from those of levels
@@ -65,9 +64,3 @@ def rolled(guide, sim, actions, simulation, key, level, state, dist, otherwise):
     own = jax.random.uniform(jax.random.fold_in(simulation, _SHARE), (), jnp.float32) < guide.share
     x = draw_by_bins(jax.random.fold_in(key, _HEAD), logits, actions, dist)
     return select(own & (level < guide.levels), x, otherwise)
-
-
-def child_value(guide, sim, state, x):
-    """v(s, a); 0 where it is not finite."""
-    v = predicted_value(guide.heads, observation(sim, state), flat(x))
-    return jnp.where(jnp.isfinite(v), v, 0)
