@@ -86,13 +86,13 @@ def test_intervals_hold_the_truth_and_ratios_are_sharper(copies):
     curves, ratios, errors, alone = [], [], [], []
     for _ in range(120):
         found = [row(rng, i, 300, copies) for i in range(len(LIMITS))]
-        j = join_rows(keys(8), MADE, found)
-        low, high = np.log(j.curve[:, 1:].T)
+        curve, ratio, _ = join_rows(keys(8), MADE, found)
+        low, high = np.log(curve[:, 1:].T)
         curves.append(np.mean((low < truth) & (truth < high)))
-        (low, high), step = np.log(j.ratios[:, 1:].T), np.diff(truth)
+        (low, high), step = np.log(ratio[:, 1:].T), np.diff(truth)
         ratios.append(np.mean((low < step) & (step < high)))
-        errors.append(np.log(j.ratios[:, 0]) - step)
-        gaps = np.diff(np.log(j.curve[:, 0])) - step  # NaN beside one that stands alone
+        errors.append(np.log(ratio[:, 0]) - step)
+        gaps = np.diff(np.log(curve[:, 0])) - step  # NaN beside one that stands alone
         np.testing.assert_allclose(gaps, np.where(np.isnan(gaps), gaps, errors[-1]), atol=1e-6)
         alone.append(np.diff([r.log_mean for r in found]) - step)
     for hits in (curves, ratios):
@@ -106,22 +106,22 @@ def test_a_row_that_is_flagged_takes_no_part():
     rng = np.random.default_rng(0)
     found = [row(rng, i, 300) for i in range(4)]
     found[1] = found[1]._replace(reliable=False)
-    j = join_rows(keys(4), MADE[:4], found)
-    assert np.isnan(j.curve[1]).all() and np.isfinite(np.delete(j.curve, 1, 0)).all()
-    assert np.isnan(j.ratios[:2]).all() and np.isfinite(j.ratios[2]).all()
+    curve, ratios, _ = join_rows(keys(4), MADE[:4], found)
+    assert np.isnan(curve[1]).all() and np.isfinite(np.delete(curve, 1, 0)).all()
+    assert np.isnan(ratios[:2]).all() and np.isfinite(ratios[2]).all()
     for none in (None, 3, found[0]._replace(draws=None), found[1]):
-        assert join_rows(keys(2), MADE[:2], [found[0], none]) is None
-    assert join_rows(keys(1), MADE[:1], found[:1]) is None
+        assert join_rows(keys(2), MADE[:2], [found[0], none]) == (None, None, {})
+    assert join_rows(keys(1), MADE[:1], found[:1]) == (None, None, {})
     dear = found[0]._replace(settings=dict(budget=10_000))
-    assert join_rows(keys(2), MADE[:2], [dear, dear]) is None
+    assert join_rows(keys(2), MADE[:2], [dear, dear]) == (None, None, {})
 
 
 def test_rows_without_common_failures_stand_alone():
     rng = np.random.default_rng(0)
     a, b = row(rng, 0, 300, sides=(1,)), row(rng, 1, 300, sides=(-1,))
     apart = [walk(3.0), walk(9.0)]
-    j = join_rows(keys(2), apart, [a, b])
-    assert np.isnan(j.curve).all() and j.ratios[0, 0] == pytest.approx(b.mean / a.mean)
+    curve, ratios, _ = join_rows(keys(2), apart, [a, b])
+    assert np.isnan(curve).all() and ratios[0, 0] == pytest.approx(b.mean / a.mean)
 
 
 def test_a_row_that_misses_a_failure_mode_is_named():
@@ -130,11 +130,11 @@ def test_a_row_that_misses_a_failure_mode_is_named():
     found = [row(rng, i, 2000, error=0.02) for i in range(5)]
     lost = row(rng, 2, 2000, error=0.02, sides=(1,))
     found[2] = lost._replace(log_mean=lost.log_mean - math.log(2))
-    j = join_rows(keys(5), MADE[:5], found)
-    assert j.apart == (1, 2)
-    assert join_rows(keys(5), MADE[:5], [row(rng, i, 2000) for i in range(5)]).apart == ()
-    none, said = (None,) * 5, dict(judged=1, apart=[1, 2])
-    table = Sweep({"limit": tuple(LIMITS[:5])}, (1,) * 5, none, none, said, *j[:2])
+    *curve_and_ratios, said = join_rows(keys(5), MADE[:5], found)
+    assert said["apart"] == [1, 2]
+    assert "apart" not in join_rows(keys(5), MADE[:5], [row(rng, i, 2000) for i in range(5)])[2]
+    none = (None,) * 5
+    table = Sweep({"limit": tuple(LIMITS[:5])}, (1,) * 5, none, none, said, *curve_and_ratios)
     assert str(table).splitlines()[-2:] == [
         "rows 1 and 2: their failures say another ratio",
         "rows 2 and 3: their failures say another ratio",

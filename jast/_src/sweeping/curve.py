@@ -27,20 +27,7 @@ from jast._src.normal_space.transform import Latent, dimension
 from jast._src.util.intervals import log_normal
 from jast.estimate import Estimate
 
-__all__ = ["Curve", "join_rows"]
-
-
-class Curve(NamedTuple):
-    """The rows of a sweep as one curve. NaN where a row takes no part."""
-
-    curve: np.ndarray
-    """[N, 3] probability, and the ends of its interval."""
-    ratios: np.ndarray
-    """[N - 1, 3] likewise of the probability of the next row over that of a row."""
-    apart: tuple[int, ...]
-    """Rows that contradict the ratio to the next one."""
-    episodes: int
-    """Simulated for the ratios."""
+__all__ = ["join_rows"]
 
 
 class Row(NamedTuple):
@@ -78,15 +65,17 @@ class Row(NamedTuple):
 
 def join_rows(
     keys: Sequence[jax.Array], made: Sequence[Simulator], found: Sequence[Any]
-) -> Curve | None:
-    """The `Curve` of the results ``found`` of `jast.estimate.failure_probability` with ``keys`` on
-    systems of one kind; None where no two of them can be joined.
+) -> tuple[np.ndarray | None, np.ndarray | None, dict[str, Any]]:
+    """The results ``found`` of `jast.estimate.failure_probability` with ``keys`` on systems of one
+    kind as one curve: what `Sweep` has as ``curve`` and ``ratios``, NaN where a row takes no part,
+    and what its ``settings`` then say (``judged``, ``apart``). (None, None, {}) where no two of
+    them can be joined.
     """
     places = np.array([i for i, each in enumerate(zip(made, found)) if _takes_part(*each)], int)
     chain = [(keys[i], made[i], found[i]) for i in places]
     m, n = len(chain), len(found)
     if m < 2:
-        return None
+        return None, None, {}
     said, covariance, episodes = _measure(chain)
     steps = np.diff(np.eye(m), axis=0)
     against = np.concatenate([steps, -np.eye(m - 1)], axis=1)
@@ -107,7 +96,10 @@ def join_rows(
     errors = np.sqrt(np.diagonal(steps @ covariance @ steps.T))
     for k in np.flatnonzero(np.diff(places) == 1):
         ratios[places[k]] = np.exp(steps[k] @ logs + half * errors[k])
-    return Curve(curve, ratios, tuple(places[:-1][apart].tolist()), episodes)
+    notes: dict[str, Any] = dict(judged=episodes)
+    if apart.any():
+        notes["apart"] = places[:-1][apart].tolist()
+    return curve, ratios, notes
 
 
 def _measure(chain):

@@ -135,7 +135,7 @@ def sweep(
             found, ended = run_here(rows, follow, store, watch), ""
         else:
             found, ended = run_in_executor(rows, executor, store, watch)
-        curve = _join(function, rows, found)
+        curve, ratios, said = _join(function, rows, found)
     outcomes, errors = zip(*found, strict=True)
     if all(e is not None for e in errors) and len(found) == n:
         raise errors[0]
@@ -144,18 +144,14 @@ def sweep(
     )
     if len(found) < n:
         settings["interrupted"] = f"after {len(found)} of {n} values{ended}"
-    if curve is not None:
-        settings["judged"] = curve.episodes
-        if curve.apart:
-            settings["apart"] = list(curve.apart)
     return Sweep(
         values={k: v[: len(found)] for k, v in columns.items()},
         results=outcomes,
         errors=tuple(None if e is None else f"{type(e).__name__}: {e}" for e in errors),
         simulators=tuple(None if isinstance(s, Exception) else s for s in made[: len(found)]),
-        settings=settings,
-        curve=None if curve is None else curve.curve,
-        ratios=None if curve is None else curve.ratios,
+        settings=settings | said,
+        curve=curve,
+        ratios=ratios,
     )
 
 
@@ -175,13 +171,13 @@ def _check_arguments(name, called, args, named):
 
 
 def _join(function, rows, found):
-    """The `Curve` of the rows that are done, where they are one kind of cheap systems."""
+    """`join_rows` of those that are done, where they are one kind of cheap systems."""
     if function is not failure_probability or count_kinds(rows.made) > 1:
-        return None
+        return None, None, {}
     try:
         return join_rows(rows.keys, rows.made, [result for result, _ in found])
     except KeyboardInterrupt:  # the rows stand for themselves
-        return None
+        return None, None, {}
 
 
 def _rows(values):
