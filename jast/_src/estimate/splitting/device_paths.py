@@ -21,10 +21,10 @@ from jast._src.core.rewards import log_likelihood
 from jast._src.core.signature import signature_of
 from jast._src.core.simulator import Simulator
 from jast._src.core.transition import Progress, advance, begin, blank, conclude
-from jast._src.estimate.splitting.levels import FRESH, Played
+from jast._src.estimate.splitting.levels import FRESH, NAME, Played
 from jast._src.runtime._jax import jit
 from jast._src.runtime.memory import require, size
-from jast._src.util.pytrees import index_tree
+from jast._src.util.pytrees import index_tree, select
 
 __all__ = ["DevicePaths", "require_paths"]
 
@@ -91,12 +91,12 @@ class DevicePaths:
         return Played(top[:m], invalid[:m], int(steps[:m].sum()), int(undefined[:m].sum()))
 
 
-def require_paths(name: str, sim: Simulator, n: int) -> None:
+def require_paths(sim: Simulator, n: int) -> None:
     """ValueError where the states of ``n`` paths do not fit into memory."""
     signature = signature_of(sim)
     row = size(signature.state) + np.dtype(signature.dtype).itemsize
     needed = 2 * n * (sim.horizon + 1) * row
-    require(name, needed, f"the states of {n} episodes", "use fewer particles")
+    require(NAME, needed, f"the states of {n} episodes", "use fewer particles")
 
 
 @partial(jit, donate_argnums=0)
@@ -160,7 +160,7 @@ def _first(sim, score, key, fresh, state, value, t, live):
     ended = (value == jnp.inf) | (t >= sim.horizon) | jnp.asarray(sim.is_terminal(state))
     no = jnp.zeros((), bool)
     old = Lane(state, value, t, value, ended, no, jnp.zeros((), jnp.int32))
-    lane = jax.tree.map(lambda a, b: jnp.where(fresh, a, b), new, old)
+    lane = select(fresh, new, old)
     return lane._replace(done=lane.done | ~live)
 
 
@@ -194,7 +194,7 @@ def _next(sim, score, key, lane):
     after = advance(sim, log_likelihood, blank(sim, lane.state), x, lane.t + 1 >= sim.horizon)
     new = _lane(score, conclude(sim, log_likelihood, after), lane.t + 1)
     new = new._replace(top=jnp.maximum(lane.top, new.top), undefined=lane.undefined + new.undefined)
-    return jax.tree.map(lambda a, b: jnp.where(lane.done, a, b), lane, new)
+    return select(lane.done, lane, new)
 
 
 def _lane(score, progress: Progress, t):

@@ -8,8 +8,9 @@ import numpy as np
 from jast._src.core.counter_prng import numpy_generator
 from jast._src.estimate.proposal_search.mixture_draws import resample
 
-__all__ = ["FRESH", "Played", "Run", "climb"]
+__all__ = ["FRESH", "NAME", "Played", "Run", "climb"]
 
+NAME = "splitting"  # of the call, in messages
 FRESH = -1
 """The parent of a new episode."""
 KILLED = 0.25

@@ -7,13 +7,14 @@ import numpy as np
 
 from jast._src.blackbox.snapshots import BranchingRunner
 from jast._src.core.simulator import Simulator
+from jast._src.estimate.splitting.levels import NAME
 from jast._src.estimate.splitting.object_paths import ObjectPaths
 from jast._src.runtime.host_errors import hosts_of
 
 __all__ = ["branching_objects", "check_objects"]
 
 
-def branching_objects(name: str, sim: Simulator) -> Any:
+def branching_objects(sim: Simulator) -> Any:
     """What saves and resumes the objects of a black box; None for a simulator in JAX. ValueError
     for a black box without objects in this process.
     """
@@ -22,54 +23,54 @@ def branching_objects(name: str, sim: Simulator) -> Any:
         return None
     if host.spec.episodic:
         raise ValueError(
-            f"{name}: sim must be a black box of objects that are judged at every state"
+            f"{NAME}: sim must be a black box of objects that are judged at every state"
             " (episodic=False), since a function of whole episodes cannot be resumed: use"
             " jast.estimate.failure_probability"
         )
     return BranchingRunner(host)
 
 
-def check_objects(name: str, key: jax.Array, sim: Simulator, objects: Any) -> int:
+def check_objects(key: jax.Array, sim: Simulator, objects: Any) -> int:
     """Play an episode, and its second half twice more from a saved state; how many steps that took.
     ValueError where they do not come to the same.
     """
     paths, saved, at, looks, xs = ObjectPaths(key, sim, None, 1, objects), None, 0, [], []
     (lane,) = paths.begin(1)
-    _check_methods(name, lane.thing)
+    _check_methods(lane.thing)
     while not lane.over:
         if lane.steps & (lane.steps - 1) == 0:  # at 0, 1, 2, 4, ..: at half of the whole, or later
-            saved, at = _attempt(name, objects.save, lane.thing), lane.steps
+            saved, at = _attempt(objects.save, lane.thing), lane.steps
         xs.append([a[0] for a in paths.draw([lane])])
         looks.append(paths.move(lane, xs[-1]))
     steps = lane.steps
     if saved is None:
         return steps
     for _ in range(2):  # the second time, of what the first one left of it
-        again = _attempt(name, objects.resume, saved, lane.x0)
+        again = _attempt(objects.resume, saved, lane.x0)
         found = _replayed(objects, again, lane.x0, xs, at)
         steps += len(found)
         if not _alike(looks[at:], found):
             fresh = _replayed(objects, objects.begin(lane.x0)[0], lane.x0, xs, 0)
-            raise ValueError(_difference(name, saved.copied, at, _alike(looks, fresh)))
+            raise ValueError(_difference(saved.copied, at, _alike(looks, fresh)))
     return steps
 
 
-def _check_methods(name, thing):
+def _check_methods(thing):
     has = [method for method in ("snapshot", "restore") if callable(getattr(thing, method, None))]
     if len(has) == 1:
         raise ValueError(
-            f"{name}: an object of the black box must have both methods snapshot() and"
+            f"{NAME}: an object of the black box must have both methods snapshot() and"
             f" restore(saved), or neither; received {type(thing).__name__} with {has[0]} only"
         )
 
 
-def _attempt(name, function, *args):
+def _attempt(function, *args):
     """What ``function`` returns; ValueError where an object cannot be saved or resumed."""
     try:
         return function(*args)
     except Exception as error:
         raise ValueError(
-            f"{name}: an object of the black box must have working methods snapshot() and"
+            f"{NAME}: an object of the black box must have working methods snapshot() and"
             " restore(saved), or be one that copy.deepcopy copies; received"
             f" {type(error).__name__}: {error}"
         ) from error
@@ -92,17 +93,17 @@ def _alike(looks, others):
     return len(looks) == len(others) and all(a.same(b) for a, b in zip(looks, others))
 
 
-def _difference(name, copied, at, deterministic):
+def _difference(copied, at, deterministic):
     """Why the same disturbances came to another end."""
     if not deterministic:
         return (
-            f"{name}: the black box must be deterministic, received two outcomes of the same"
+            f"{NAME}: the black box must be deterministic, received two outcomes of the same"
             " disturbances: seed every random number generator in initialize, or make its draws"
             " part of the disturbance"
         )
     what = "a copy by copy.deepcopy" if copied else "restore(saved) of its snapshot()"
     return (
-        f"{name}: {what} must bring back all of an object, received one that goes on differently"
+        f"{NAME}: {what} must bring back all of an object, received one that goes on differently"
         f" from step {at} on under the same disturbances: is something outside of the object, or"
         " shared by saved states that change with it?"
     )

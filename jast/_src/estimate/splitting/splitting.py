@@ -19,7 +19,7 @@ from jast._src.estimate.estimate import Estimate, estimate_from_mean
 from jast._src.estimate.population.search import Answer, contradictions
 from jast._src.estimate.replicates import LOST_MODE_REMARK, MIN_REPLICATES, mean_of_replicates
 from jast._src.estimate.splitting.device_paths import DevicePaths, require_paths
-from jast._src.estimate.splitting.levels import Run, climb
+from jast._src.estimate.splitting.levels import NAME, Run, climb
 from jast._src.estimate.splitting.object_checks import branching_objects, check_objects
 from jast._src.estimate.splitting.object_paths import ObjectPaths
 from jast._src.runtime import work
@@ -34,7 +34,6 @@ from jast._src.util.pytrees import as_partial, shapes_text, traceable
 
 __all__ = ["splitting"]
 
-NAME = "splitting"
 MIN_PARTICLES = 10
 """Particles of a run at least: a level is an order statistic of them."""
 MIN_ANCESTORS = 10
@@ -125,18 +124,18 @@ def splitting(
     runs = whole_number(NAME, "runs", runs, MIN_REPLICATES)
     level = checked_level(NAME, level)
     contract(NAME, sim)
-    objects, before = branching_objects(NAME, sim), incidents(sim)
+    objects, before = branching_objects(sim), incidents(sim)
     score = _checked_score(sim, score)
     _check_states(sim, score)
     if objects is None:
-        require_paths(NAME, sim, particles)
+        require_paths(sim, particles)
     placement = work.placement(NAME, executor, devices)
     about = dict(sim=sim, particles=particles, runs=runs, score=score)
     with (
         open_checkpoint(NAME, checkpoint, key, **about) as store,
         Watch(NAME, runs, "run", progress, callback) as watch,
     ):
-        checked = 0 if objects is None else check_objects(NAME, key, sim, objects)
+        checked = 0 if objects is None else check_objects(key, sim, objects)
         shared = jax.random.split(key, runs), sim, score, particles
         task = Task(_run, shared, lambda: Run(*Run._fields))
         placement = placement._replace(store=store)
@@ -156,7 +155,7 @@ def splitting(
 def _run(shared, number, context):
     """The `Run` of a number, of arrays."""
     keys, sim, score, particles = shared
-    objects = branching_objects(NAME, sim)
+    objects = branching_objects(sim)
     if objects is None:
         paths = DevicePaths(keys[number], sim, score, particles)
     else:
