@@ -17,6 +17,7 @@ from jast._src.core.typing import Array, Numeric
 from jast._src.runtime._jax import is_traced
 from jast._src.util import display
 from jast._src.util.checks import wrong
+from jast._src.util.pytrees import select
 
 __all__ = [
     "Gaussian",
@@ -186,7 +187,7 @@ def fit(g: Gaussian, x: jax.Array, weights: jax.Array) -> Gaussian:
     w = w / jnp.sum(w)
     mean, covariance = moments(jnp.where(counted[:, None], x, 0), w)
     good = jnp.all(jnp.isfinite(mean)) & is_definite(covariance, mean, n) & (jnp.sum(counted) > d)
-    return jax.tree.map(lambda new, old: jnp.where(good, new, old), Gaussian(mean, covariance), g)
+    return select(good, Gaussian(mean, covariance), g)
 
 
 def moments(x: jax.Array, w: jax.Array) -> tuple[jax.Array, jax.Array]:

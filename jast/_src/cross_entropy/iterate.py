@@ -19,6 +19,7 @@ from jast._src.cross_entropy import gaussian, mixture, surrogates
 from jast._src.cross_entropy.gaussian import Gaussian
 from jast._src.cross_entropy.mixture import Mixture
 from jast._src.cross_entropy.result import CEResult, History
+from jast._src.util.pytrees import select
 
 __all__ = ["Plan", "Settings", "State", "ask", "begin", "finish", "run", "tell"]
 
@@ -46,7 +47,7 @@ class Plan(NamedTuple):
     """Those searches have the current covariance, not the initial one"""
     surrogate: str = ""
     detail: int | str | None = None
-    """Of the surrogate: see `surrogates.DETAILS`"""
+    """Of the surrogate: see `surrogates.fit`"""
     warp: str = ""
     frame: str = ""
     """Of the surrogate: "window", that of the points it sees, or "initial", the scale of the
@@ -132,8 +133,8 @@ def ask(plan: Plan, state: State) -> jax.Array:
 def tell(plan, settings, state, x, value):
     """The `State` after the values [max(m)] at ``x`` [max(m), d]."""
     k, rows = state.k, jnp.arange(max(plan.counts), dtype=jnp.int32)
-    begins = np.cumsum((0, *plan.counts))
-    at, count, kept = _at(begins, k), _at(plan.counts, k), _at(plan.elites, k)
+    at = _at(np.cumsum((0, *plan.counts)), k)
+    count, kept = _at(plan.counts, k), _at(plan.elites, k)
     live = rows < count
     value = jnp.where(live, value, jnp.inf)
     places = jnp.where(live, at + rows, len(state.value))
@@ -147,8 +148,7 @@ def tell(plan, settings, state, x, value):
     if plan.method == "ce_method":
         proposal = gaussian.fit(proposal, *elites)  # Algorithm 1
     else:
-        since = _at([begins[max(0, i + 1 - plan.memory)] for i in range(len(plan.counts))], k)
-        seen = _surrogate_data(plan, state, since, at + count)
+        seen = _surrogate_data(plan, state)
         proposal, better, judged = refit_with_surrogate(
             _key(state, 1), plan, settings, proposal, state.first, elites, seen, _at(plan.chosen, k)
         )
@@ -176,16 +176,15 @@ def _elites(x, value, count, most):
     return Points(jnp.where(weights[:, None], x[i], x[i[0]]), weights.astype(x.dtype))
 
 
-def _surrogate_data(plan, state, since, until):
-    """What the surrogate is fitted to, (x, values, mask): rows ``since`` to ``until`` of the log,
-    and the best before.
+def _surrogate_data(plan, state):
+    """What the surrogate is fitted to, (x, values, mask): the rows of the log of the iterations
+    that it remembers, and the best before.
     """
     n, begins = len(state.value), np.cumsum((0, *plan.counts))
-    width = max(
-        begins[i + 1] - begins[max(0, i + 1 - plan.memory)] for i in range(len(plan.counts))
-    )
+    firsts = [begins[max(0, i + 1 - plan.memory)] for i in range(len(plan.counts))]
+    width, since = max(begins[1:] - firsts), _at(firsts, state.k)
     rows = since + jnp.arange(width, dtype=jnp.int32)
-    mask = rows < until
+    mask = rows < _at(begins[1:], state.k)
     if older := min(plan.best, n - width):
         before = (jnp.arange(n, dtype=jnp.int32) < since) & jnp.isfinite(state.value)
         _, i = lax.top_k(-jnp.where(before, state.value, jnp.inf), older)
@@ -263,20 +262,10 @@ def moments(proposal):
     return Gaussian(mean, within + jnp.einsum("k,kd,ke->de", w, z, z))
 
 
-class ModelSearch(NamedTuple):
-    """The outcome of short searches on the surrogate, one an elite."""
-
-    x: jax.Array
-    """[n, d]: the best point of each"""
-    value: jax.Array
-    """[n]: what the surrogate says there"""
-    fitted: Gaussian
-    """[n, ...]: their last proposals"""
-
-
 def search_around(key, model, centres, covariance, samples, elites, iterations):
-    """`ModelSearch`: the cross-entropy method on a surrogate ``model`` ([n, d] -> [n]) from
-    N(centre, covariance), for each of ``centres`` [n, d] (Algorithm 4).
+    """The cross-entropy method on a surrogate ``model`` ([n, d] -> [n]) from N(centre, covariance),
+    for each of ``centres`` [n, d] (Algorithm 4): (the best point of each [n, d], what the surrogate
+    says there [n], their last proposals, a `Gaussian` [n, ...]).
     """
 
     def search(key, centre):
@@ -291,7 +280,7 @@ def search_around(key, model, centres, covariance, samples, elites, iterations):
 
         start = Gaussian(centre, covariance), centre, jnp.asarray(jnp.inf, centre.dtype)
         (g, best, value), _ = lax.scan(iterate, start, jax.random.split(key, iterations))
-        return ModelSearch(best, value, g)
+        return best, value, g
 
     return jax.vmap(search)(jax.random.split(key, len(centres)), centres)
 
@@ -309,29 +298,26 @@ def refit_with_surrogate(key, plan, settings, proposal, first, elites, seen, cho
     y, mask = surrogates.warp_values(plan.warp, y, mask)
     window = plan.frame == "window"
     frame = surrogates.whitening_frame(x, mask) if window else _spherical_frame(moments(first))
-    model = surrogates.fit(plan.surrogate, x, y, mask, frame, plan.detail)
-    mean = partial(surrogates.predict, plan.surrogate, model)
-    aim = mean
-    if plan.optimistic:
-        aim = partial(surrogates.lower_bound, plan.surrogate, model, settings.optimism)
+    mean = surrogates.fit(plan.surrogate, x, y, mask, frame, plan.detail)
+    aim = partial(mean, optimism=settings.optimism) if plan.optimistic else mean
 
     judged = draw(for_samples, proposal, plan.judged)  # Algorithm 3
     _, i = lax.top_k(-mean(judged), max(plan.chosen))
     model_elites = Points(judged[i], (jnp.arange(len(i), dtype=jnp.int32) < chosen).astype(x.dtype))
 
     spread = (moments(proposal) if plan.current else moments(first)).covariance / settings.alpha
-    sub = search_around(for_searches, aim, elites.x, spread, *plan.sub)
-    found = Points(sub.x, elites.weights)
+    best, value, fitted = search_around(for_searches, aim, elites.x, spread, *plan.sub)
+    found = Points(best, elites.weights)
     # Algorithm 2: true, model and sub-elites
     everything = jax.tree.map(lambda *a: jnp.concatenate(a), elites, model_elites, found)
-    best = jnp.argsort(jnp.where(elites.weights > 0, sub.value, jnp.inf))
+    better = best[jnp.argsort(jnp.where(elites.weights > 0, value, jnp.inf))]
     if isinstance(proposal, Gaussian):
-        return gaussian.fit(proposal, *everything), sub.x[best], judged
-    new = _refit_mixture(plan, settings, proposal, elites, sub, spread, everything)
-    return new, sub.x[best], judged
+        return gaussian.fit(proposal, *everything), better, judged
+    new = _refit_mixture(plan, settings, proposal, elites, fitted, spread, everything)
+    return new, better, judged
 
 
-def _refit_mixture(plan, settings, proposal, elites, sub, spread, everything):
+def _refit_mixture(plan, settings, proposal, elites, fitted, spread, everything):
     """Algorithm 5: expectation maximisation from a component an elite, `plan.components` of
     them.
     """
@@ -339,12 +325,12 @@ def _refit_mixture(plan, settings, proposal, elites, sub, spread, everything):
     there = elites.weights[:k]
     weights = there / jnp.maximum(jnp.sum(there), 1)
     if plan.start == "searches":
-        first = Mixture(weights, sub.fitted.mean[:k], sub.fitted.covariance[:k])
+        first = Mixture(weights, fitted.mean[:k], fitted.covariance[:k])
     else:
         covariances = jnp.broadcast_to(spread[None], (k, *spread.shape))
         first = Mixture(weights, elites.x[:k], covariances)
     new = mixture.em(first, *everything, regularisation=settings.regularisation)
-    return jax.tree.map(lambda a, b: jnp.where(jnp.any(there > 0), a, b), new, proposal)
+    return select(jnp.any(there > 0), new, proposal)
 
 
 def _spherical_frame(proposal):

@@ -132,9 +132,10 @@ def _surrogate_plan(method, chosen, most, each, kept, d):
         ),
         detail={
             "gaussian process": chosen["kernel"],
+            "linear": 1,
             "polynomial": whole_number(method, "degree", chosen["degree"], 1),
             "radial basis": chosen["basis"],
-        }.get(chosen["surrogate"]),
+        }[chosen["surrogate"]],
     )
 
 

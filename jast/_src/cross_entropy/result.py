@@ -74,7 +74,6 @@ class CEResult(NamedTuple):
 
     def __str__(self) -> str:
         value = np.asarray(self.best_value)
-        n = np.asarray(self.history.value).shape[-1]
         bad = int(np.sum(self.invalid))
         note = f"\n{bad} evaluations gave NaN or infinity; they are never elites" if bad else ""
         if value.ndim == 0:
@@ -97,8 +96,8 @@ class CEResult(NamedTuple):
             f" +- {found.std(ddof=1) / np.sqrt(found.size):.2g}" if found.size > 1 else ""
         )
         return (
-            f"{value.size} runs of {n} evaluations: best value {mean} (mean and its standard"
-            f" error), the best of them {value.min():.6g}{note}"
+            f"{value.size} runs of {self.episodes} evaluations: best value {mean} (mean and its"
+            f" standard error), the best of them {value.min():.6g}{note}"
         )
 
 

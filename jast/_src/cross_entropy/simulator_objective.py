@@ -71,7 +71,7 @@ class Stress:
         """The `jast.Episode` at the point ``z`` [D], replayed, with its states. ValueError for
         another shape.
         """
-        return rollout(jax.random.key(0), self.sim, _policy(self.sim, self.actions, z), self.reward)
+        return _played(self.sim, self.reward, self.actions, z)
 
     def failures(self, result: CEResult, top: int = 64) -> Failures:
         """The ``top`` best distinct failures among all points that ``result``, a `CEResult`,
@@ -159,7 +159,7 @@ def over(sim: Simulator, *, reward: Reward | None = None, actions: Actions | Non
 
 
 def _value(sim, reward, actions, z):
-    e = rollout(jax.random.key(0), sim, _policy(sim, actions, z), reward)
+    e = _played(sim, reward, actions, z)
     if isinstance(reward, LogLikelihood):
         c = -e.reward
         rank = jnp.where(c >= 0, -1 / (1 + jnp.maximum(c, 0)), c - 1)
@@ -171,20 +171,17 @@ def _value(sim, reward, actions, z):
 
 @jax.jit
 def _episodes(sim, reward, actions, rows):
-    def play(z):
-        episode = rollout(jax.random.key(0), sim, _policy(sim, actions, z), reward)
-        return episode._replace(states=None)
-
-    return jax.vmap(play)(rows)
+    return jax.vmap(lambda z: _played(sim, reward, actions, z)._replace(states=None))(rows)
 
 
-def _policy(sim, actions, z):
-    """The `Policy` that plays the point ``z`` [D]."""
+def _played(sim, reward, actions, z):
+    """The episode of the point ``z`` [D]."""
     like, unflat = _flat(sim)
     z = jnp.asarray(z)
     if z.shape != like.shape:
         raise ValueError(f"over: a point must have the shape {like.shape}, received {z.shape}")
-    return latent_policy(sim, actions, *unflat(z.astype(like.dtype)))
+    policy = latent_policy(sim, actions, *unflat(z.astype(like.dtype)))
+    return rollout(jax.random.key(0), sim, policy, reward)
 
 
 def _flat(sim: Simulator) -> tuple[jax.Array, Callable[[jax.Array], Any]]:

@@ -11,7 +11,6 @@ at each point of the grid, in closed form; the noise is relative to it.
 """
 
 import math
-from dataclasses import dataclass, field
 from itertools import combinations_with_replacement
 from typing import NamedTuple
 
@@ -19,7 +18,6 @@ import jax
 import jax.numpy as jnp
 from jax.scipy.linalg import cho_factor, cho_solve, solve_triangular
 from jax.scipy.special import ndtri
-from jax.tree_util import register_dataclass
 
 __all__ = [
     "KERNELS",
@@ -28,8 +26,6 @@ __all__ = [
     "WARPS",
     "Frame",
     "fit",
-    "lower_bound",
-    "predict",
     "warp_values",
     "whitening_frame",
 ]
@@ -57,9 +53,7 @@ KERNELS = {
 """Correlation as a function of the squared distance in lengthscales."""
 
 
-@register_dataclass
-@dataclass(frozen=True)
-class GaussianProcess:
+class GaussianProcess(NamedTuple):
     """A fitted process: what `predict_process` needs."""
 
     x: jax.Array
@@ -79,7 +73,7 @@ class GaussianProcess:
     """Relative to ``variance``, jitter included."""
     log_likelihood: jax.Array
     """Of the observed y, at these hyperparameters (R&W eq. 2.30)."""
-    kernel: str = field(default="squared exponential", metadata=dict(static=True))
+    kernel: str
 
 
 def fit_process(x, y, mask, lengthscales, noises=NOISES, kernel="squared exponential"):
@@ -154,28 +148,6 @@ class Frame(NamedTuple):
     """[d, d], lower triangular"""
 
 
-class Surrogate(NamedTuple):
-    """A fitted model."""
-
-    frame: Frame
-    model: "GaussianProcess | Basis"
-
-
-@register_dataclass
-@dataclass(frozen=True)
-class Basis:
-    """Least squares on basis functions, which `predict` finds by the kind of the model."""
-
-    x: jax.Array
-    """[n, d]: the points, which are the centres of radial basis functions"""
-    mask: jax.Array
-    """[n] bool"""
-    weights: jax.Array
-    """[features]"""
-    detail: int | str | None = field(default=None, metadata=dict(static=True))
-    """The degree of a polynomial, the name of a radial function."""
-
-
 RADIAL = {
     "gaussian": lambda r2, d: jnp.exp(-0.5 * r2 / d),
     "linear": lambda r2, d: jnp.sqrt(r2 + jnp.finfo(r2.dtype).tiny),
@@ -187,7 +159,7 @@ Wheeler 2019, section 14.4; the names are those of the thesis's code).
 """
 
 
-def _polynomial(x, centres, mask, degree):
+def _monomials(x, degree):
     """All monomials up to the degree: [m, C(d + degree, degree)]."""
     products = [
         jnp.prod(x[:, jnp.asarray(which)], axis=1, keepdims=True)
@@ -197,33 +169,10 @@ def _polynomial(x, centres, mask, degree):
     return jnp.concatenate([jnp.ones_like(x[:, :1]), *products], axis=1)
 
 
-def _radial(x, centres, mask, name):
-    r2 = squared_distances(x, centres)
-    return jnp.where(mask[None, :], RADIAL[name](r2, x.shape[1]), 0)
-
-
-BASES = {"linear": _polynomial, "polynomial": _polynomial, "radial basis": _radial}
-DETAILS = {
-    "gaussian process": "squared exponential",
-    "linear": 1,
-    "polynomial": 2,
-    "radial basis": "gaussian",
-}
-"""Of each kind, where none is given: the kernel, the degree (twice), the radial function."""
-SURROGATES = tuple(DETAILS)
+SURROGATES = "gaussian process", "linear", "polynomial", "radial basis"
 RIDGE = 1e-4  # of the least squares, as a share of the features' mean square; a convention
+WARPS = "raw", "standard", "rank"
 ROUND = 0.1  # weight of the identity in a frame, so that few points do
-
-
-def _raw(y, mask):
-    """The values as they are, but for their size."""
-    return y / jnp.maximum(jnp.max(jnp.abs(y)), jnp.finfo(y.dtype).tiny)
-
-
-def _standard(y, mask):
-    n = jnp.maximum(jnp.sum(mask, dtype=y.dtype), 1)
-    centred = jnp.where(mask, y - jnp.sum(y) / n, 0)
-    return centred / jnp.maximum(jnp.sqrt(jnp.sum(centred**2) / n), jnp.finfo(y.dtype).tiny)
 
 
 def _rank(y, mask):
@@ -236,9 +185,6 @@ def _rank(y, mask):
     return jnp.where(mask, ndtri(jnp.clip((less + 0.5 * equal) / n, 1e-4, 1 - 1e-4)), 0)
 
 
-WARPS = {"raw": _raw, "standard": _standard, "rank": _rank}
-
-
 def warp_values(warp, y, mask):
     """(values to model [n], their mask): non-finite ones are left out, but for the ranks, where
     they are the worst.
@@ -246,7 +192,12 @@ def warp_values(warp, y, mask):
     finite = mask & jnp.isfinite(y)
     if warp == "rank":
         return _rank(jnp.where(finite, y, jnp.inf), mask), mask
-    return WARPS[warp](jnp.where(finite, y, 0), finite), finite
+    y, tiny = jnp.where(finite, y, 0), jnp.finfo(y.dtype).tiny
+    if warp == "raw":  # as they are, but for their size
+        return y / jnp.maximum(jnp.max(jnp.abs(y)), tiny), finite
+    n = jnp.maximum(jnp.sum(finite, dtype=y.dtype), 1)
+    centred = jnp.where(finite, y - jnp.sum(y) / n, 0)
+    return centred / jnp.maximum(jnp.sqrt(jnp.sum(centred**2) / n), tiny), finite
 
 
 def whitening_frame(x, mask):
@@ -268,39 +219,40 @@ def whitening_frame(x, mask):
     return Frame(centre, jnp.sqrt(variances)[:, None] * jnp.linalg.cholesky(correlation))
 
 
-def fit(kind, x, y, mask, frame, detail=None):
-    """The `Surrogate` of this kind (of `SURROGATES`) for points ``x`` [n, d] with warped values
-    ``y`` [n], where ``mask`` [n]; ``detail``: see `DETAILS`.
+def fit(kind, x, y, mask, frame, detail):
+    """The surrogate of this kind (of `SURROGATES`) for points ``x`` [n, d] with warped values ``y``
+    [n], where ``mask`` [n]; ``detail``: the kernel, the degree (of the linear one 1), or the radial
+    function.
+
+    It is a function of points [m, d]: what it expects there, [m], on the scale of the warped
+    values. With ``optimism`` that is so many standard deviations less; only a Gaussian process
+    knows any.
     """
-    detail = DETAILS[kind] if detail is None else detail
     z = jnp.where(mask[:, None], _in_frame(frame, jnp.where(mask[:, None], x, 0)), 0)
     if kind == "gaussian process":
-        return Surrogate(frame, fit_process(z, y, mask, LENGTHSCALES, kernel=detail))
-    features = jnp.where(mask[:, None], BASES[kind](z, z, mask, detail), 0)
+        gp = fit_process(z, y, mask, LENGTHSCALES, kernel=detail)
+
+        def predict(x, optimism=None):
+            if optimism is None:
+                return predict_process(gp, _in_frame(frame, x))
+            mean, variance = predict_process(gp, _in_frame(frame, x), variance=True)
+            return mean - optimism * jnp.sqrt(variance)
+
+        return predict
+
+    def basis(x):
+        if kind != "radial basis":
+            return _monomials(x, detail)
+        return jnp.where(mask[None, :], RADIAL[detail](squared_distances(x, z), x.shape[1]), 0)
+
+    features = jnp.where(mask[:, None], basis(z), 0)
     normal = features.T @ features
     # a masked centre is no feature
     live = jnp.maximum(jnp.sum(jnp.diagonal(normal) > 0, dtype=x.dtype), 1)
     ridge = jnp.maximum(RIDGE * jnp.trace(normal) / live, jnp.finfo(x.dtype).tiny)
     definite = normal + ridge * jnp.eye(len(normal), dtype=x.dtype)
     weights = cho_solve(cho_factor(definite), features.T @ jnp.where(mask, y, 0))
-    return Surrogate(frame, Basis(z, mask, weights, detail))
-
-
-def predict(kind, surrogate, x):
-    """What the model expects at ``x`` [m, d]: [m], on the scale of the warped values."""
-    z = _in_frame(surrogate.frame, x)
-    if kind == "gaussian process":
-        return predict_process(surrogate.model, z)
-    model = surrogate.model
-    return BASES[kind](z, model.x, model.mask, model.detail) @ model.weights
-
-
-def lower_bound(kind, surrogate, optimism, x):
-    """[m]: the mean less ``optimism`` standard deviations; only a Gaussian process knows any."""
-    if kind != "gaussian process":
-        return predict(kind, surrogate, x)
-    mean, variance = predict_process(surrogate.model, _in_frame(surrogate.frame, x), variance=True)
-    return mean - optimism * jnp.sqrt(variance)
+    return lambda x, optimism=None: basis(_in_frame(frame, x)) @ weights
 
 
 def _in_frame(frame, x):
