@@ -37,7 +37,7 @@ from jast._src.estimate.gaussians.mixture_fit import (
 from jast._src.estimate.host_populations import cool, equilibrate, explore
 from jast._src.estimate.proposal_search import adapt, by_proposal
 from jast._src.estimate.proposal_search.mixture_draws import log_ratio, random_numbers
-from jast._src.estimate.proposal_search.search_state import search_context
+from jast._src.estimate.proposal_search.search_state import SearchState, search_context
 from jast._src.normal_space import transform as L
 from jast.estimate import (
     adaptive_cross_entropy,
@@ -158,10 +158,13 @@ def test_the_draws_of_the_model_guarantee_an_interval(key):
 
 @pytest.mark.slow
 def test_plain_draws_where_no_proposal_serves(key, monkeypatch):
-    """Then subset simulation answers, flagged, and its guarantee is the first batch's."""
+    """Then subset simulation answers, flagged, and its guarantee is of the first batch and of the
+    first draws of its populations.
+    """
     monkeypatch.setattr(by_proposal.Search, "suffices", property(lambda s: False))
     found = failure_probability(key, planes(4.0), BUDGET)
-    assert "subset simulation" in str(found.warnings) and found.plain == (0, 0, BUDGET // 25)
+    assert "subset simulation" in str(found.warnings)
+    assert found.plain == (0, 0, BUDGET // 25 + found.samples)
     lines = str(found).splitlines()
     i = next(i for i, line in enumerate(lines) if line.startswith("probability    between 0 and"))
     assert lines[i + 1].startswith("doubtful ") and lines[0].startswith("UNRELIABLE: ")
@@ -480,6 +483,42 @@ def test_populations_give_up(key):
     assert found.evaluations <= 3000
     assert found.points.shape == (0, 4)
     assert len(explore(key, planes(12.0), SIZE, min_log_probability=-5.0).levels) <= 5
+
+
+def test_populations_that_only_estimate_leave_out_the_last_moves(key):
+    long, short = explore(key, planes(4.0), SIZE), explore(key, planes(4.0), SIZE, final_moves=0)
+    assert short.log_mean == long.log_mean and short.reached
+    assert long.evaluations - short.evaluations == 5 * SIZE
+
+
+def test_populations_wait_where_no_level_falls(key):
+    """A distance of whole numbers: of 12 points hardly one moves at each level."""
+
+    def g(z):
+        return jnp.ceil(4 * (4.0 - jnp.sum(z) / 6)) / 4
+
+    keys = jax.random.split(key, 10)
+    hasty, patient = (
+        [explore(k, limit_state(g, 36), 12, patience=n).reached for k in keys] for n in (0, 5)
+    )
+    assert sum(hasty) < 5 < sum(patient)
+    stuck = explore(key, limit_state(lambda z: 1.0 + 0 * z[0], 4), SIZE, patience=5)
+    assert not stuck.reached and stuck.evaluations == SIZE * (1 + 1 + 5)
+
+
+def test_first_draws_of_a_population_are_plain_draws(key):
+    found = explore(key, limit_state(lambda z: jnp.where(z[1] > 2, jnp.nan, -z[0]), 2), SIZE)
+    # 4 standard errors of binomial counts
+    for count, p in zip(found.plain[:2], (0.5 * norm.cdf(2), norm.sf(2)), strict=True):
+        assert abs(count - p * SIZE) < 4 * np.sqrt(p * (1 - p) * SIZE)
+    assert found.plain[2] == SIZE
+
+
+def test_an_efficiency_of_few_effective_draws_is_not_believed():
+    f = GaussianFamily(planes(4.0), BUDGET, search_context(jax.random.key(0)))
+    for log_weight, known in ((np.zeros(20), True), (np.r_[0.0, np.full(19, -9.0)], False)):
+        state = SearchState(q=0, efficiency=0.5, log_mean=-9.0, log_weight=log_weight)
+        assert by_proposal.Search(f, state).suffices == known
 
 
 def test_cooling_keeps_every_mode(key):

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scipy.stats import multivariate_normal, norm, truncnorm
+from scipy.stats import chi2, multivariate_normal, norm, truncnorm
 
 import jast
 from benchmarks.few_calls import SlowLane, plane, planes, slow_lane
@@ -20,13 +20,15 @@ from jast._src.estimate.gaussians.mixture_fit import (
     unit_gaussians,
 )
 from jast._src.estimate.gaussians.moments import explore_moments
-from jast._src.estimate.host_populations import draw_wide
+from jast._src.estimate.host_populations import draw_wide, wide_enough
 from jast._src.estimate.proposal_search.audit import FORGOTTEN, audit_proposal
 from jast._src.estimate.proposal_search.mixture_draws import random_numbers
 from jast._src.estimate.proposal_search.search_state import search_context
 from jast._src.estimate.proposal_search.settings import FEW_RUNS
 from jast._src.normal_space import transform
 from jast._src.normal_space.moments import distances, slopes
+from jast.blackbox import from_python
+from jast.distributions import MultivariateNormalDiag
 from jast.estimate import failure_probability
 from jast.simulators import limit_state
 
@@ -128,7 +130,8 @@ def test_a_plane_of_a_hundred_numbers(budget, gradients, error):
 def test_wide_noise_has_a_tenth_of_failures_beyond_a_plane():
     """Within 4 standard errors of a binomial share of 2000 draws."""
     rng = np.random.default_rng(0)
-    failures, width = draw_wide(rng, planes(3.5), 2000, norm.logsf(3.5))
+    width = wide_enough(norm.logsf(3.5))
+    failures = draw_wide(rng, planes(3.5), 2000, width)
     assert width == pytest.approx(3.5 / norm.isf(0.1)) and (failures.used == 60).all()
     assert abs(len(failures.z) / 2000 - 0.1) < 4 * np.sqrt(0.1 * 0.9 / 2000)
 
@@ -174,6 +177,72 @@ def _either_side(z):
 def test_two_half_spaces_are_both_found_or_missed_aloud(g, truth):
     p = failure_probability(jax.random.key(0), limit_state(g, 40), 3000)
     assert not p.reliable or abs(p.mean / truth - 1) < max(4 * p.relative_error, 0.1)
+
+
+def _energy(z):
+    return 88.0 - jnp.sum(z**2)
+
+
+def _any_far(z):
+    return 5.0 - jnp.abs(z).max()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "g, numbers, truth",
+    [
+        (_energy, 40, chi2.sf(88.0, 40)),
+        (_any_far, 300, -np.expm1(300 * np.log1p(-2 * norm.sf(5.0)))),
+    ],
+)
+def test_where_half_spaces_do_not_serve_populations_tell_about(g, numbers, truth):
+    """Never believed. Each key within a factor of 20, the mean of logarithms within 3: a level of
+    30 points is wrong by .3 in the logarithm (a binomial share of .25), eight of them by .9, more
+    where points are alike; three populations by half of it.
+    """
+    sim = limit_state(g, numbers)
+    found = [failure_probability(jax.random.key(k), sim, 3000) for k in range(4)]
+    apart = np.array([p.log_mean for p in found]) - np.log(truth)
+    assert not any(p.reliable for p in found) and max(p.evaluations for p in found) <= 3000
+    assert np.abs(apart).max() < np.log(20) and abs(apart.mean()) < np.log(3)
+    assert all("subset simulation" in " ".join(p.warnings) for p in found)
+    assert all(p.plain[2] >= 60 and p.guaranteed[1] > truth for p in found)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("bound", [88.0, 300.0])
+def test_populations_of_a_black_box_stay_within_its_budget(bound):
+    """Also where none reaches a failure, and plain draws follow."""
+    runs = []
+
+    def energy(z):
+        runs.append(0)
+        left = bound - float(np.sum(z**2))
+        return left <= 0, max(left, 0.0)
+
+    noise = MultivariateNormalDiag(jnp.zeros(40), jnp.ones(40))
+    p = failure_probability(
+        jax.random.key(0), from_python(energy, horizon=1, disturbance=noise), 700
+    )
+    assert 650 < len(runs) <= p.evaluations == 700 and not p.reliable
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("numbers, budget", [(40, 1200), (40, 3000), (100, 5000), (300, 3000)])
+def test_many_modes_of_which_few_are_found_are_told(numbers, budget):
+    """Failure beyond +-5 in any number: a search finds ten of these modes, of which draws and lines
+    tell the same. Three of eight keys believed an eighth of the truth.
+    """
+    truth = -np.expm1(numbers * np.log1p(-2 * norm.sf(5.0)))
+    for k in range(4):
+        p = failure_probability(jax.random.key(k), limit_state(_any_far, numbers), budget)
+        assert not p.reliable or abs(p.mean / truth - 1) < max(4 * p.relative_error, 0.1), str(p)
+
+
+def test_another_mode_has_its_failures_followed_and_another_moment_has_not():
+    for sim, others in ((limit_state(_any_far, 40), True), (lane(), False)):
+        f = GaussianFamily(sim, 3000, search_context(jax.random.key(0)), FEW_RUNS, "moments")
+        assert (explore_moments(f, None, True).cooled is not None) == others
 
 
 @pytest.mark.slow

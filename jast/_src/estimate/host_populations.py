@@ -32,6 +32,7 @@ __all__ = [
     "equilibrate",
     "explore",
     "next_level",
+    "wide_enough",
 ]
 
 LEVEL_SHARE = 0.25
@@ -77,6 +78,10 @@ class Explored(NamedTuple):
     """The miss distances of the levels, or the widths of the noise, falling"""
     evaluations: int
     invalid: int
+    plain: np.ndarray
+    """[3] its first draws, which are the model's own: those that fail and are not covered, the
+    invalid ones, and all
+    """
     complete: bool = True
     """False where it was ended by its greatest number of evaluations"""
 
@@ -111,6 +116,7 @@ class PopulationSampler:
         self.size, self.covered = size, covered
         self.scale, self.accepted = FIRST_SCALE, math.nan
         self.evaluations = self.invalid = 0
+        self.plain = np.zeros(3, int)
         self.dtype, self.dimension = normal_numbers(sim), dimension(sim)
         if covered is not None and isinstance(covered[0], Tilts):
             self.dimension = tilts.dimension(shape(sim), sim.horizon)
@@ -173,10 +179,21 @@ class PopulationSampler:
             levels=np.asarray(levels, np.float64),
             evaluations=self.evaluations,
             invalid=self.invalid,
+            plain=self.plain,
         )
 
 
-def explore(key, sim, size, *, covered=None, min_log_probability=-math.inf, max_evaluations=10**9):
+def explore(
+    key,
+    sim,
+    size,
+    *,
+    covered=None,
+    min_log_probability=-math.inf,
+    max_evaluations=10**9,
+    final_moves=FINAL_MOVES,
+    patience=0,
+):
     """Subset simulation: take a population of ``size`` points down the levels of the miss distance
     to the failures of ``sim``: `Explored`.
 
@@ -184,29 +201,36 @@ def explore(key, sim, size, *, covered=None, min_log_probability=-math.inf, max_
     out, so that the population looks for failures that q does not draw, and the estimate is of
     those alone. Points are what q has them to be.
     It stops below ``min_log_probability``, where it would take more than ``max_evaluations``, and
-    where no level falls further.
+    where no level falls further, after ``patience`` moves at the last one. ``final_moves`` among
+    failures part their copies.
     """
     sampler = PopulationSampler(numpy_generator(key), sim, size, covered)
     population = sampler.draw(1.0)
-    level, levels = math.inf, []
+    failing = int((population.score == -math.inf).sum())
+    sampler.plain = np.array([failing, int(population.invalid.sum()), size])
+    level, levels, waited = math.inf, [], 0
     log_mean, complete = 0.0, True
     while True:
         score = population.score
         if np.mean(score == -np.inf) < LEVEL_SHARE:
             if log_mean < min_log_probability:
                 break
-            complete = sampler.evaluations + size * (1 + FINAL_MOVES) <= max_evaluations
+            complete = sampler.evaluations + size * (1 + final_moves) <= max_evaluations
             if not complete:
                 break
-        level = next_level(score, level, LEVEL_SHARE)
-        if level is None:
-            break
+        lower = next_level(score, level, LEVEL_SHARE)
+        if lower is None:
+            if waited == patience or level == math.inf:
+                break
+            population, waited = sampler.move(population, level, 1.0, 1), waited + 1
+            continue
+        level, waited = lower, 0
         log_mean += math.log(np.mean(score <= level))
         elites = np.flatnonzero(score <= level)
         # each elite as often as any other, or once more
         population = index_tree(population, elites[(np.arange(size) + len(levels)) % len(elites)])
         if level == -math.inf:
-            failures = sampler.move(population, level, 1.0, FINAL_MOVES)
+            failures = sampler.move(population, level, 1.0, final_moves)
             return sampler.result(failures, log_mean, levels)
         population = sampler.move(population, level, 1.0, 1)
         levels.append(level)
@@ -241,24 +265,29 @@ def draw_wide_failures(key, sim, n, *, covered=None):
     return index_tree(population, failing), width, sampler
 
 
-def draw_wide(rng, sim, n, log_mean, *, moves=0, covered=None):
-    """The failures among ``n`` draws of noise so wide that a half-space with the probability of
-    ``log_mean`` has `FAILING_SHARE` of them: (`Population` [m], the width). ``covered`` as in
-    `explore`. Of a tenth of that probability it has nearly as many: .067 of the draws for 2e-4,
-    .086 for 1e-8.
+def wide_enough(log_mean):
+    """The width of noise under which a half-space with the probability of ``log_mean`` has
+    `FAILING_SHARE` of the draws. One of a tenth of that probability has nearly as many: .067 for
+    2e-4, .086 for 1e-8.
+    """
+    from scipy.special import ndtri, ndtri_exp  # here: slow to import
+
+    return max(float(ndtri_exp(min(log_mean, 0.0)) / ndtri(FAILING_SHARE)), 1.0)
+
+
+def draw_wide(rng, sim, n, width, *, moves=0, covered=None):
+    """The failures among ``n`` draws of noise of this ``width``: `Population` [m]. ``covered`` as
+    in `explore`.
 
     With ``moves``, the failures that they walk to: each makes so many Markov moves, which are taken
     where the miss distance does not grow. As none replaces another one, a region of failures is
     found that most points are far from.
     """
-    from scipy.special import ndtri, ndtri_exp  # here: slow to import
-
-    width = max(float(ndtri_exp(min(log_mean, 0.0)) / ndtri(FAILING_SHARE)), 1.0)
     sampler = PopulationSampler(rng, sim, n, covered)
     population = sampler.draw(width)
     for _ in range(moves):
         population = sampler.move(population, population.score, width, 1)
-    return index_tree(population, population.score == -np.inf), width
+    return index_tree(population, population.score == -np.inf)
 
 
 def bracket_boundary(key, sim, n):

@@ -43,8 +43,6 @@ ALIKE = 0.97
 """Cosine above which the less likely of two is left out: of the drone of `benchmarks.closed_loops`
 (key 0, 5000 evaluations) 24 stay of 128, and batches of 200 have effective sample sizes of 70, 58
 and 42 in place of 32, 10 and 29."""
-MOST = 64
-"""Half-spaces of a proposal at most. A convention."""
 SPREAD = 2.0
 """Factor on the variance beyond a plane: with it, and a fifth of wide copies at the same place, .45
 effective draws a draw where the plane is right, .21 where the boundary is .3 standard deviations
@@ -122,18 +120,17 @@ def merge_planes(old: Planes, new: Planes) -> Planes:
     return index_tree(both, np.sort(kept))
 
 
-def likely(planes: Planes) -> Planes:
-    """Those of great probability."""
+def likely(planes: Planes, least: float = LITTLE) -> Planes:
+    """Those with more than this part of the greatest probability of one."""
     mass = planes.log_mass
-    return index_tree(planes, mass > mass.max() + math.log(LITTLE))
+    return index_tree(planes, mass > mass.max() + math.log(least))
 
 
 def that_matter(planes: Planes, d: int) -> Planes:
-    """The `likely` ones that differ from one another, as many as a proposal is to hold with their
-    wide copies.
+    """The `likely` ones that differ from one another, as many as a proposal holds with their wide
+    copies.
     """
-    planes, kept = likely(planes), []
-    most = min(most_components(d) // 2, MOST)
+    planes, kept, most = likely(planes), [], most_components(d) // 2
     for i in np.argsort(-planes.log_mass, kind="stable"):
         if len(kept) < most and (planes.normal[kept] @ planes.normal[i]).max(initial=-1) < ALIKE:
             kept.append(i)

@@ -14,6 +14,7 @@ from jast._src.estimate.host_populations import (
     draw_wide,
     equilibrate,
     explore,
+    wide_enough,
 )
 from jast._src.estimate.proposal_search.adapt import adapt_proposal
 from jast._src.estimate.proposal_search.search_state import (
@@ -138,9 +139,8 @@ def _draw_widely(family, state, n, moves=0):
     many ``moves`` each.
     """
     outside = family.exclusion(state.q, _coverage_threshold(family, state))
-    failures, width = draw_wide(
-        family.context.rng, family.sim, n, state.log_mean, moves=moves, covered=outside
-    )
+    width = wide_enough(state.log_mean)
+    failures = draw_wide(family.context.rng, family.sim, n, width, moves=moves, covered=outside)
     wide = f"{width:.2f} times wider noise"
     said = f"walks from {wide} end uncovered" if moves else f"draws of {wide} not covered"
     state = state.note(f"audit: {len(failures.z)} of {n} {said}", n * (1 + moves))
@@ -263,7 +263,7 @@ def _check_uncovered_share(family, state):
     settings = family.settings
     if share <= settings.uncovered_share:
         return state
-    if effective_sample_size(state.log_weight[rows]) >= settings.uncovered_ess:
+    if effective_sample_size(state.log_weight[rows]) >= settings.known_ess:
         return state
     return state.with_reason(
         f"{share:.0%} of the probability found lies where the proposal hardly draws"

@@ -19,6 +19,7 @@ from jast._src.estimate import weight_sums
 from jast._src.estimate.estimate import Estimate, estimate_from_counts, estimate_from_weights
 from jast._src.estimate.gaussians.exploration import draw_model, explore_failures
 from jast._src.estimate.gaussians.family import GaussianFamily
+from jast._src.estimate.gaussians.mixture_fit import effective_sample_size
 from jast._src.estimate.gaussians.moments import explore_moments
 from jast._src.estimate.importance_sampling import chunks
 from jast._src.estimate.monte_carlo import plain_traces, simulate_points
@@ -98,9 +99,13 @@ class Search(NamedTuple):
 
     @property
     def suffices(self) -> bool:
-        """Whether what is left of the budget tells the probability by the proposal."""
-        left = self.family.budget - self.state.spent
-        return self.efficiency * left > self.family.settings.min_ess
+        """Whether what is left of the budget tells the probability by the proposal, as far as
+        batches of more than a few effective draws say.
+        """
+        s, left = self.family.settings, self.family.budget - self.state.spent
+        if not self.efficiency * left > s.min_ess:
+            return False
+        return effective_sample_size(self.state.log_weight) >= s.known_ess
 
     @property
     def proposal(self) -> Any:
@@ -136,8 +141,37 @@ def _answer(request, context, reasons):
     if serves:
         return _draw_moments(request, _audit(first), reasons)
     if rest.budget < s.moments_alone_budget:
-        return _draw(request, first, reasons)
+        return _draw_few(request, first, reasons)
     return _after(state, _draw(rest, _search(rest, context), reasons))
+
+
+def _draw_few(request, search, reasons):
+    """The `Estimate` of what few runs of moments left, where these do not serve: by populations;
+    half of it where no failure was seen, which leaves plain draws to bound what these miss.
+    """
+    state = search.state
+    if search.suffices or state.log_p > -math.inf:
+        return _draw(request, search, reasons)
+    n = max((request.budget - state.spent) // 2, 1)
+    found, state = _draw_populations(request, state, n, -math.log(n), reasons)
+    plain = _draw(request, search._replace(state=state), reasons)
+    if found is None or plain.reliable:
+        return plain
+    counts = tuple(a + b for a, b in zip(found.plain, plain.plain, strict=True))
+    return found._replace(episodes=plain.episodes, history=plain.history, plain=counts)
+
+
+def _draw_populations(request, state, n, log_mean, reasons):
+    """(The `Estimate` of a few populations with ``n`` evaluations, the state after them): None
+    where they are too few, or the populations reach no failure.
+    """
+    against = [*reasons, *state.reasons] or [UNUSABLE]
+    found = fallback_estimate(request.key, request.sim, n, log_mean, request.level, against)
+    if found is None:
+        return None, state
+    found = _after(state, found)
+    state = state._replace(spent=found.episodes, history=found.history, plain=found.plain)
+    return None if math.isnan(found.log_mean) else found, state
 
 
 def _after(state, found):
@@ -290,16 +324,17 @@ def _draw(request, search, reasons):
     """
     f, state = search
     name, key, sim, level = request.name, request.key, request.sim, request.level
-    n = max(request.budget - state.spent, f.batch)  # a search of many parts may have spent all
-    watch = Watch(name, n, "episode", *request.watched)
+    n = max(request.budget - state.spent, 1)  # a search of many parts may have spent all
     often = math.exp(min(state.log_p, 0.0)) * n >= request.settings.plain_failures
     about_proposal = [*reasons, *state.reasons]
     if not (search.suffices or often) and request.otherwise and _has_many_steps(request):
         return _after(state, request.otherwise(n))
-    if not search.suffices and not often and state.log_p > -math.inf:
-        found = fallback_estimate(key, sim, n, state.log_p, level, about_proposal or [UNUSABLE])
+    if not (search.suffices or often) and state.log_p > -math.inf:
+        found, state = _draw_populations(request, state, n, state.log_p, reasons)
         if found is not None:
-            return _after(state, found)
+            return found
+        search, n = search._replace(state=state), max(request.budget - state.spent, 1)
+    watch = Watch(name, n, "episode", *request.watched)
     if search.suffices or (search.efficiency and not often):
         against = about_proposal if search.suffices else [*about_proposal, UNUSABLE]
         return _draw_proposal(request, search, watch, against, f.settings.min_ess)

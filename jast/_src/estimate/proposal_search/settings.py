@@ -174,8 +174,9 @@ class SearchSettings(NamedTuple):
     """Part of the probability, by the batches, that may be uncovered."""
     coverage_draws: int = 20
     """Draws that a part of that share must have met to count as covered."""
-    uncovered_ess: int = 10
-    """Effective draws of the batches with which an uncovered part is known well enough."""
+    known_ess: int = 10
+    """Effective draws of the batches with which an efficiency, or an uncovered part of the
+    probability, is known well enough."""
     audit_share: float = 0.15
     """What a population of an audit is to cost."""
     wide_audit: int = 0
