@@ -201,6 +201,16 @@ def diffusion(z: float, steps: int) -> Simulator:
     return system([0.0, 0.0], step, lambda s: z - s[0] - 2 * s[1], 2, steps, episodic=True)
 
 
+def energy(z: Any) -> Any:
+    """88 less the sum of squares: no direction fails before another."""
+    return 88.0 - jnp.sum(z**2)
+
+
+def any_far(z: Any) -> Any:
+    """Failure beyond +-5 in any number: two modes for each."""
+    return 5.0 - jnp.max(jnp.abs(z))
+
+
 def asian_option(z: Any) -> Any:
     """An option on the mean of 89 daily prices: 14 less its discounted payoff."""
     dt = 1 / 3 / 88
@@ -224,7 +234,7 @@ SYSTEMS = {
     "four-branch, far": System(lambda: branches(10.0, 5.0), four_branch_probability(10.0, 5.0)),
 }
 # lane: `probability_of_lane` of tests/test_moments.py with 1.5 million draws, standard error .02 %;
-# diffusion and option: transition operators and quadrature; closed loops:
+# diffusion and option: transition operators and quadrature; energy: chi-square; closed loops:
 # `benchmarks.closed_loops`
 MANY = {
     "lane, 600": System(lane, 5.0355e-5, 600),
@@ -238,6 +248,8 @@ MANY = {
     "diffusion 3, 200": System(partial(diffusion, 3.0, 200), 9.1231e-6, 1200),
     "diffusion 4, 50": System(partial(diffusion, 4.0, 50), 2.346e-8, 1200),
     "Asian option": System(lambda: limit_state(asian_option, 88), 1.577745e-3, 1200),
+    "energy": System(lambda: limit_state(energy, 40), 1.8429071e-5, 5000),
+    "any of 40": System(lambda: limit_state(any_far, 40), 2.2931869e-5, 3000),
 } | {f"{loop.name} loop": System(lambda x=loop: x.simulator, loop.truth, 5000) for loop in JUDGED}
 # as few calls as methods of active learning print: 67 and 26 to 40 of the AK family, 680 to 4011
 # for the damped oscillator; truths by quadrature

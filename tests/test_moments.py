@@ -9,7 +9,7 @@ import pytest
 from scipy.stats import chi2, multivariate_normal, norm, truncnorm
 
 import jast
-from benchmarks.few_calls import SlowLane, plane, planes, slow_lane
+from benchmarks.few_calls import SlowLane, any_far, energy, plane, planes, slow_lane
 from benchmarks.first_minute import lane
 from jast._src.estimate.gaussians import half_spaces
 from jast._src.estimate.gaussians.family import GaussianFamily
@@ -179,20 +179,12 @@ def test_two_half_spaces_are_both_found_or_missed_aloud(g, truth):
     assert not p.reliable or abs(p.mean / truth - 1) < max(4 * p.relative_error, 0.1)
 
 
-def _energy(z):
-    return 88.0 - jnp.sum(z**2)
-
-
-def _any_far(z):
-    return 5.0 - jnp.abs(z).max()
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "g, numbers, truth",
     [
-        (_energy, 40, chi2.sf(88.0, 40)),
-        (_any_far, 300, -np.expm1(300 * np.log1p(-2 * norm.sf(5.0)))),
+        (energy, 40, chi2.sf(88.0, 40)),
+        (any_far, 300, -np.expm1(300 * np.log1p(-2 * norm.sf(5.0)))),
     ],
 )
 def test_where_half_spaces_do_not_serve_populations_tell_about(g, numbers, truth):
@@ -215,14 +207,14 @@ def test_populations_of_a_black_box_stay_within_its_budget(bound):
     """Also where none reaches a failure, and plain draws follow."""
     runs = []
 
-    def energy(z):
+    def counted(z):
         runs.append(0)
         left = bound - float(np.sum(z**2))
         return left <= 0, max(left, 0.0)
 
     noise = MultivariateNormalDiag(jnp.zeros(40), jnp.ones(40))
     p = failure_probability(
-        jax.random.key(0), from_python(energy, horizon=1, disturbance=noise), 700
+        jax.random.key(0), from_python(counted, horizon=1, disturbance=noise), 700
     )
     assert 650 < len(runs) <= p.evaluations == 700 and not p.reliable
 
@@ -235,12 +227,12 @@ def test_many_modes_of_which_few_are_found_are_told(numbers, budget):
     """
     truth = -np.expm1(numbers * np.log1p(-2 * norm.sf(5.0)))
     for k in range(4):
-        p = failure_probability(jax.random.key(k), limit_state(_any_far, numbers), budget)
+        p = failure_probability(jax.random.key(k), limit_state(any_far, numbers), budget)
         assert not p.reliable or abs(p.mean / truth - 1) < max(4 * p.relative_error, 0.1), str(p)
 
 
 def test_another_mode_has_its_failures_followed_and_another_moment_has_not():
-    for sim, others in ((limit_state(_any_far, 40), True), (lane(), False)):
+    for sim, others in ((limit_state(any_far, 40), True), (lane(), False)):
         f = GaussianFamily(sim, 3000, search_context(jax.random.key(0)), FEW_RUNS, "moments")
         assert (explore_moments(f, None, True).cooled is not None) == others
 

@@ -107,8 +107,11 @@ class BranchingRunner(Runner):
             raise
         except BaseException as error:  # SystemExit too: the system's, not ours
             thing, look = None, Look(False, np.nan, True, 0.0, np.zeros(self.size))
-            example = fill(self.spec.x0, list(x0)), fill(self.x, list(xs)) if xs else ()
-            host.log.add(*said(error), lambda: example)
+
+            def example():
+                return fill(self.spec.x0, list(x0)), fill(self.x, list(xs)) if xs else ()
+
+            host.log.add(*said(error), example)
         with host.lock:
             host.count(calls=1, rows=1, seconds=time.perf_counter() - begun, **counts)
         return thing, look

@@ -199,6 +199,7 @@ class Where(Distribution):
     def __init__(self, pred: Array | bool, a: DistributionLike, b: DistributionLike) -> None:
         self.pred: jax.Array = jnp.asarray(pred)
         self.parts: tuple[Any, Any] = (a, b)
+        """``(a, b)``"""
 
     @property
     def event_shape(self) -> Any:

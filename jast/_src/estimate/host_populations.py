@@ -80,7 +80,7 @@ class Explored(NamedTuple):
     invalid: int
     plain: np.ndarray
     """[3] its first draws, which are the model's own: those that fail and are not covered, the
-    invalid ones, and all
+    invalid ones, and all; 0 where it began elsewhere
     """
     complete: bool = True
     """False where it was ended by its greatest number of evaluations"""
@@ -202,7 +202,7 @@ def explore(
     those alone. Points are what q has them to be.
     It stops below ``min_log_probability``, where it would take more than ``max_evaluations``, and
     where no level falls further, after ``patience`` moves at the last one. ``final_moves`` among
-    failures part their copies.
+    failures part their copies; without any there are no copies.
     """
     sampler = PopulationSampler(numpy_generator(key), sim, size, covered)
     population = sampler.draw(1.0)
@@ -227,6 +227,8 @@ def explore(
         level, waited = lower, 0
         log_mean += math.log(np.mean(score <= level))
         elites = np.flatnonzero(score <= level)
+        if level == -math.inf and not final_moves:
+            return sampler.result(index_tree(population, elites), log_mean, levels)
         # each elite as often as any other, or once more
         population = index_tree(population, elites[(np.arange(size) + len(levels)) % len(elites)])
         if level == -math.inf:

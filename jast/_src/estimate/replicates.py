@@ -43,6 +43,8 @@ def mean_of_replicates(logs: Sequence[float], what: str, level: float) -> Replic
         reasons.append(f"{n - seen} of {n} {what} reached no failure")
     if not seen:
         return Replicates(math.nan, math.nan, (0.0, 1.0), 0.0, math.nan, tuple(reasons))
+    if n == 1:
+        return Replicates(float(logs[0]), math.inf, (0.0, 1.0), 1.0, 1.0, ("one alone tells it",))
     p = np.exp(logs - logs.max())
     log_mean = float(logs.max()) + math.log(p.mean())
     relative = float(p.std(ddof=1) / math.sqrt(n) / p.mean())

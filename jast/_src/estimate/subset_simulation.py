@@ -12,6 +12,7 @@ from jast._src.core.simulator import Simulator
 from jast._src.core.typing import Callback, Executor, PathLike, PRNGKey
 from jast._src.estimate.estimate import Estimate, estimate_from_mean
 from jast._src.estimate.host_populations import LEVEL_SHARE, Explored, explore
+from jast._src.estimate.population.search import Answer, contradictions
 from jast._src.estimate.replicates import LOST_MODE_REMARK, MIN_REPLICATES, mean_of_replicates
 from jast._src.normal_space import transform
 from jast._src.runtime import work
@@ -31,9 +32,10 @@ FALLBACK_REPLICATES = 5
 """Populations where no proposal was found; `MIN_REPLICATES` where these would be small."""
 LEAST_SAMPLES = 16
 """Members of such a population at the least: four of them reach the next level."""
+MORE_ROUNDS = 1.25
+"""Factor on the rounds that a population took, for the next one: of 8 levels they differ by 2."""
 PATIENCE = 5
-"""Moves at a level that does not fall: of 16 points none may have moved. Of ten calls on a loop
-with gusts, 2000 evaluations, the logarithm was wrong by 2.1 without them, 1.1 with 5 or 12."""
+"""Moves at a level that does not fall: of 16 points none may have moved. A convention."""
 MIN_LOG_PROBABILITY = -690.0
 """Where a population gives up: the log of the least double, nearly."""
 
@@ -123,9 +125,16 @@ def _run_replicate(shared, number, context):
 def estimate_from_replicates(
     method: str, runs: Sequence[Explored], level: float, reasons: Sequence[str] = ()
 ) -> Estimate:
-    """The `Estimate` of independent populations; ``reasons`` speak against it."""
-    found = mean_of_replicates([float(r.log_mean) for r in runs], "populations", level)
-    reasons = (*reasons, *found.reasons)
+    """The `Estimate` of independent populations; ``reasons`` speak against it. It is the mean of
+    those that the budget did not cut off.
+    """
+    told, plain = [r for r in runs if r.complete], tuple(map(int, sum(r.plain for r in runs)))
+    found = mean_of_replicates([float(r.log_mean) for r in told], "populations", level)
+    if cut := len(runs) - len(told):
+        reasons = (*reasons, f"the budget cut off {cut} of {len(runs)} populations")
+    answer = Answer(found.log_mean, found.relative)
+    against = [] if math.isnan(found.log_mean) else contradictions(answer, plain)
+    reasons = (*reasons, *found.reasons, *against)
     history = tuple(
         f"population: {len(r.levels)} levels, log p {r.log_mean:.3f}, {r.evaluations} evaluations"
         for r in runs
@@ -142,7 +151,7 @@ def estimate_from_replicates(
         samples=sum(max(len(r.points), int(r.plain[2])) for r in runs),
         episodes=int(sum(r.evaluations for r in runs)),
         invalid=int(sum(r.invalid for r in runs)),
-        plain=tuple(map(int, sum(r.plain for r in runs))),
+        plain=plain,
         reliable=not reasons,
         warnings=(*reasons, LOST_MODE_REMARK),
         history=history,
@@ -154,23 +163,25 @@ def fallback_estimate(
 ) -> Estimate | None:
     """The `Estimate` of a few populations within ``budget``, where ``log_mean`` is about
     what they will find; None where the budget is too small. If the first one reaches no failure
-    with half of the budget, it is of that one alone, and says nothing.
+    with half of the budget, there are no others, and the mean is NaN.
     """
-    rounds = max(log_mean, MIN_LOG_PROBABILITY) / math.log(LEVEL_SHARE) + 2
+    rounds = np.clip(log_mean, MIN_LOG_PROBABILITY, 0.0) / math.log(LEVEL_SHARE) + 2
     enough = budget / FALLBACK_REPLICATES / rounds >= MIN_SAMPLES
     replicates = FALLBACK_REPLICATES if enough else MIN_REPLICATES
     if budget / replicates / rounds < LEAST_SAMPLES:
         return None
     runs, left = [], budget
     for i, k in enumerate(jax.random.split(key, replicates)):
-        size = max(int(left / (replicates - i) / rounds), LEAST_SAMPLES)
+        size = int(left / (replicates - i) / rounds)
+        if size < LEAST_SAMPLES:
+            break
         most = left if i == replicates - 1 else left // 2
         about = dict(min_log_probability=MIN_LOG_PROBABILITY, max_evaluations=most)
         runs.append(explore(k, sim, size, final_moves=0, patience=PATIENCE, **about))
         if not runs[0].reached:
             break
         left -= runs[-1].evaluations
-        rounds = runs[-1].evaluations / size + 1  # as many as this one took, and one more
+        rounds = MORE_ROUNDS * runs[-1].evaluations / size
     sizes = ", ".join(str(r.plain[2]) for r in runs)
     said = f"this is the answer of subset simulation, populations of {sizes}"
     return estimate_from_replicates("failure_probability", runs, level, [*reasons, said])

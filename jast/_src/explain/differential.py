@@ -15,7 +15,7 @@ from jast._src.core.simulator import Simulator, first_state, next_state
 from jast._src.core.typing import Array, PRNGKey
 from jast._src.runtime._jax import quick
 from jast._src.stress_testing.report import Report
-from jast._src.util.pytrees import select, shapes_text, with_strong_types
+from jast._src.util.pytrees import select, with_strong_types
 
 __all__ = ["differential", "regression"]
 
@@ -111,10 +111,10 @@ def _regression(caller, sim_a, sim_b):
         contract(caller, sim)
     a, b = signature_of(sim_a), signature_of(sim_b)
     for part, one, other in (("disturbance", a.x, b.x), ("start", a.x0, b.x0)):
-        if shapes_text(one) != shapes_text(other):
+        if _shapes(one) != _shapes(other):
             raise ValueError(
                 f"{caller}: {part} of sim_a and sim_b must have the same shapes, received"
-                f" {shapes_text(one)} and {shapes_text(other)}"
+                f" {_shapes(one)} and {_shapes(other)}"
             )
     return Simulator(
         init=Partial(_init, sim_a, sim_b),
@@ -127,6 +127,10 @@ def _regression(caller, sim_a, sim_b):
         observe=Partial(_observe, sim_a, sim_b),
         episodic=True,
     )
+
+
+def _shapes(like):
+    return jax.tree.map(lambda s: (s.shape, str(s.dtype)), like)
 
 
 def _arrived(sim, state, t):

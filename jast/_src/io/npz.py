@@ -78,6 +78,8 @@ def unpack(
     try:
         with np.lib.npyio.NpzFile(io.BytesIO(data)) as pack:  # which takes no pickle
             arrays = {name.removesuffix(".npy"): pack[name] for name in pack.zip.namelist()}
+        if odd := [name for name, a in arrays.items() if not isinstance(a, np.ndarray)]:
+            raise ValueError(f"{odd} hold no arrays")
         header = json.loads(arrays.pop("header").tobytes()) if "header" in arrays else {}
     except Exception as error:  # a damaged zip fails in many ways
         words = f"is damaged or truncated ({type(error).__name__}: {error})"

@@ -61,7 +61,7 @@ def probability(
             ax.text(1.02, y, _words(row), **beside)
         ax.set(xscale="log", xlabel="failure probability")
         ax.set(yticks=range(len(rows)), ylim=(len(rows) - 0.5, -0.5))
-        ax.set_yticklabels([name or e.method for name, (e, *_) in rows.items()])
+        ax.set_yticklabels([e.method if name == "" else name for name, (e, *_) in rows.items()])
         ax.tick_params(axis="y", length=0)
         ax.grid(False, axis="y")
         handles, labels = ax.get_legend_handles_labels()

@@ -176,10 +176,11 @@ def _run(state, selector, data, predict, budget, store, progress, callback):
     watch = Watch("validate", budget, "call", progress, callback, done=len(answered))
 
     def kept():
+        order, predicted, _ = _seen(answered, answers, data.labels)
         return state._replace(
             memory=memory,
-            order=np.asarray(answered, int),
-            predicted=answers.copy(),
+            order=order,
+            predicted=predicted,
             complete=len(seen.order),
             history=history,
             finished=finished,

@@ -96,8 +96,8 @@ def draw_lines(
     weight = _exp(_log_density(place) - log_q - planes.log_mass[k])
     weight *= _share(planes, line, place[:, None])[:, 0]
     wrong = failing.astype(np.float64) - (place > root)
-    doubt = weight * np.array(invalid[-n:])
-    return LineValues(known + weight * wrong, doubt, sum(invalid), len(invalid))
+    if_invalid_fail = weight * np.array(invalid[-n:])
+    return LineValues(known + weight * wrong, if_invalid_fail, int(sum(invalid)), len(invalid))
 
 
 def _exp(log):

@@ -47,9 +47,9 @@ FARTHER = 2.0
 OTHER = 0.5
 """Cosine below which a half-space is of another mode, and not of another moment or side of one. A
 convention."""
-FOLLOWED = 20
+FOLLOWED = 10
 """Failures of wide noise at most that an audit follows to where the model has them: with a chance
-of .88 one comes to a tenth of the probability."""
+of .94 one comes to a quarter of the probability, and each costs 26 evaluations."""
 BATCHES = 3
 """Batches that a proposal is fitted to, of a twenty-fifth of the budget each."""
 

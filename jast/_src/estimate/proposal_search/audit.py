@@ -263,7 +263,7 @@ def _check_uncovered_share(family, state):
     settings = family.settings
     if share <= settings.uncovered_share:
         return state
-    if effective_sample_size(state.log_weight[rows]) >= settings.known_ess:
+    if effective_sample_size(state.log_weight[rows]) >= settings.uncovered_ess:
         return state
     return state.with_reason(
         f"{share:.0%} of the probability found lies where the proposal hardly draws"

@@ -105,7 +105,7 @@ class Search(NamedTuple):
         s, left = self.family.settings, self.family.budget - self.state.spent
         if not self.efficiency * left > s.min_ess:
             return False
-        return effective_sample_size(self.state.log_weight) >= s.known_ess
+        return effective_sample_size(self.state.log_weight) >= s.promise_ess
 
     @property
     def proposal(self) -> Any:
@@ -146,8 +146,8 @@ def _answer(request, context, reasons):
 
 
 def _draw_few(request, search, reasons):
-    """The `Estimate` of what few runs of moments left, where these do not serve: by populations;
-    half of it where no failure was seen, which leaves plain draws to bound what these miss.
+    """The `Estimate` of the runs that moments left, where these do not serve. Where no failure was
+    seen, populations take half of them, and plain draws the others, which bound what these miss.
     """
     state = search.state
     if search.suffices or state.log_p > -math.inf:
@@ -158,7 +158,13 @@ def _draw_few(request, search, reasons):
     if found is None or plain.reliable:
         return plain
     counts = tuple(a + b for a, b in zip(found.plain, plain.plain, strict=True))
-    return found._replace(episodes=plain.episodes, history=plain.history, plain=counts)
+    return found._replace(
+        episodes=plain.episodes,
+        invalid=found.invalid + plain.invalid,
+        warnings=(*found.warnings, *plain.warnings),
+        history=plain.history,
+        plain=counts,
+    )
 
 
 def _draw_populations(request, state, n, log_mean, reasons):
@@ -320,7 +326,7 @@ def _draw_moments(request, search, reasons):
 
 def _draw(request, search, reasons):
     """The `Estimate` of what is left of the budget; ``reasons``: against it, whatever the search
-    found: by the proposal, by levels or by plain draws.
+    found: by the proposal, by a few populations or by plain draws.
     """
     f, state = search
     name, key, sim, level = request.name, request.key, request.sim, request.level

@@ -104,6 +104,7 @@ def add_lines(found: Estimate, lines: Lines) -> Estimate:
     """The `Estimate` that was ``found`` by draws with what ``lines`` say; UNRELIABLE where the two
     do not agree. What it says of weights and modes is of the draws.
     """
+    found = found._replace(invalid=found.invalid + lines.invalid)
     if math.isnan(found.log_mean) or not lines.values.mean() > 0:
         reason = "lines to the boundary and draws do not both tell a probability above 0"
         return found._replace(reliable=False, warnings=(reason, *found.warnings))
@@ -127,7 +128,6 @@ def add_lines(found: Estimate, lines: Lines) -> Estimate:
         mode_intervals=np.array([interval]) if one else _moved(found, log_mean),
         reliable=found.reliable and not reasons,
         warnings=(*reasons, *found.warnings),
-        invalid=found.invalid + lines.invalid,
     )
 
 
