@@ -26,6 +26,7 @@ from jast._src.estimate.proposal_search.mixture_draws import random_numbers
 from jast._src.estimate.proposal_search.search_state import search_context
 from jast._src.estimate.proposal_search.settings import FEW_RUNS
 from jast._src.normal_space import transform
+from jast._src.normal_space.evaluate_points import evaluate_points
 from jast._src.normal_space.moments import distances, slopes
 from jast.blackbox import from_python
 from jast.distributions import MultivariateNormalDiag
@@ -199,6 +200,8 @@ def test_where_half_spaces_do_not_serve_populations_tell_about(g, numbers, truth
     assert np.abs(apart).max() < np.log(20) and abs(apart.mean()) < np.log(3)
     assert all("subset simulation" in " ".join(p.warnings) for p in found)
     assert all(p.plain[2] >= 60 and p.guaranteed[1] > truth for p in found)
+    for p in found:  # their failures are kept
+        assert evaluate_points(sim, p.proposal.points).failure.all() and len(p.proposal.points)
 
 
 @pytest.mark.slow

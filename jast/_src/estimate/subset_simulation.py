@@ -12,6 +12,7 @@ from jast._src.core.simulator import Simulator
 from jast._src.core.typing import Callback, Executor, PathLike, PRNGKey
 from jast._src.estimate.estimate import Estimate, estimate_from_mean
 from jast._src.estimate.host_populations import LEVEL_SHARE, Explored, explore
+from jast._src.estimate.population.failure_sample import Sample
 from jast._src.estimate.population.search import Answer, contradictions
 from jast._src.estimate.replicates import LOST_MODE_REMARK, MIN_REPLICATES, mean_of_replicates
 from jast._src.normal_space import transform
@@ -184,4 +185,20 @@ def fallback_estimate(
         rounds = MORE_ROUNDS * runs[-1].evaluations / size
     sizes = ", ".join(str(r.plain[2]) for r in runs)
     said = f"this is the answer of subset simulation, populations of {sizes}"
-    return estimate_from_replicates("failure_probability", runs, level, [*reasons, said])
+    found = estimate_from_replicates("failure_probability", runs, level, [*reasons, said])
+    return found._replace(proposal=_failures_of([r for r in runs if r.reached]))
+
+
+def _failures_of(runs):
+    """The `Sample` of the failures that populations came to; None without any."""
+    if not runs:
+        return None
+    log_weight = [np.full(len(r.points), r.log_mean - math.log(len(r.points))) for r in runs]
+    n = sum(len(r.points) for r in runs)
+    return Sample(
+        points=np.concatenate([r.points for r in runs]),
+        used=np.concatenate([r.used for r in runs]),
+        distance=np.zeros(n),
+        log_weight=np.concatenate(log_weight),
+        group=np.arange(n, dtype=np.int32),
+    )
