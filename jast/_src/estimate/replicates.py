@@ -44,7 +44,8 @@ def mean_of_replicates(logs: Sequence[float], what: str, level: float) -> Replic
     if not seen:
         return Replicates(math.nan, math.nan, (0.0, 1.0), 0.0, math.nan, tuple(reasons))
     if n == 1:
-        return Replicates(float(logs[0]), math.inf, (0.0, 1.0), 1.0, 1.0, ("one alone tells it",))
+        reason = f"only one of the {what} tells it"
+        return Replicates(float(logs[0]), math.inf, (0.0, 1.0), 1.0, 1.0, (reason,))
     p = np.exp(logs - logs.max())
     log_mean = float(logs.max()) + math.log(p.mean())
     relative = float(p.std(ddof=1) / math.sqrt(n) / p.mean())

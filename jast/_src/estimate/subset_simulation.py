@@ -198,7 +198,7 @@ def _failures_of(runs):
     return Sample(
         points=np.concatenate([r.points for r in runs]),
         used=np.concatenate([r.used for r in runs]),
-        distance=np.zeros(n),
+        distance=np.zeros(n, runs[0].points.dtype),
         log_weight=np.concatenate(log_weight),
         group=np.arange(n, dtype=np.int32),
     )

@@ -29,7 +29,7 @@ def draw_model(f: GaussianFamily, state: SearchState) -> SearchState:
     failing = len(batch.log_weight)
     state = add_batch(f, state, batch)._replace(q=None, plain=(failing, batch.invalid, batch.size))
     state = state.note(f"draws of the model: {failing} fail", batch.size)
-    f.context.latest[:] = [(f, state)]
+    f.context.keep(f, state)
     return state
 
 

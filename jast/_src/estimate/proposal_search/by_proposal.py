@@ -307,9 +307,9 @@ def _audit(search):
     """The `Search` after the audits of its proposal."""
     f, state = search
     state = cool_failures(f, state) if isinstance(f, TiltFamily) else state
-    audited = Search(f, audit_proposal(f, state))
-    f.context.latest[:] = [audited]
-    return audited
+    state = audit_proposal(f, state)
+    f.context.keep(f, state)
+    return Search(f, state)
 
 
 def _draw_moments(request, search, reasons):

@@ -85,7 +85,7 @@ def draw_half_by_lines(f: GaussianFamily, state: SearchState) -> tuple[SearchSta
     of_draw = 1 / state.efficiency - 1
     text = f"lines: an evaluation has a relative variance of {of_line:.3g}, of draws {of_draw:.3g}"
     state = state.note(text, runs)
-    f.context.latest[:] = [(f, state)]
+    f.context.keep(f, state)
     if of_line >= of_draw or spread > MAX_SPREAD**2 * mean**2:
         return state, None
     if (rest := (left // 2 - runs) * FIRST_LINES // runs) > 0:
@@ -94,7 +94,7 @@ def draw_half_by_lines(f: GaussianFamily, state: SearchState) -> tuple[SearchSta
         if_invalid_fail = np.concatenate([if_invalid_fail, more.if_invalid_fail])
         invalid, runs = invalid + more.invalid, runs + more.runs
         state = state.note(f"lines: {rest} more", more.runs)
-        f.context.latest[:] = [(f, state)]
+        f.context.keep(f, state)
     weight = runs * of_draw / (runs * of_draw + (left - runs) * of_line)
     scale = float(np.logaddexp.reduce(state.planes.log_mass))
     return state, Lines(scale, values, weight, invalid, float(if_invalid_fail.sum()))

@@ -128,6 +128,10 @@ class SearchContext(NamedTuple):
     latest: list[tuple[Family, SearchState]]
     """The family and the state after the last batch, for an interruption"""
 
+    def keep(self, family: Family, state: SearchState) -> None:
+        """The search stands here."""
+        self.latest[:] = [(family, state)]
+
     def next_key(self) -> jax.Array:
         """A key for a population."""
         words = self.root.integers(2**32, size=2, dtype=np.uint32)
@@ -202,7 +206,7 @@ def add_batch(family: Family, state: SearchState, batch: Batch) -> SearchState:
         each = [efficiency(new, s.log_ratio) for s in scored]
         best = int(np.argmax(each))
         new = new._replace(q=scored[best].q, efficiency=each[best])
-    family.context.latest[:] = [(family, new._replace(spent=state.spent + family.batch))]
+    family.context.keep(family, new._replace(spent=state.spent + family.batch))
     return new
 
 
