@@ -1,5 +1,5 @@
-"""distrax's distributions are accepted wherever a distribution is, and jast's own agree with them
-to the bit.
+"""distrax's distributions are accepted wherever a distribution is, and jast's own agree with them:
+densities to the bit, draws up to the rounding of a product (jast's outermost ones are its own).
 """
 
 import sys
@@ -46,20 +46,30 @@ def pairs(dtype):
     return {name: (own[name], other[name]) for name in own}
 
 
+def close(a, b, rounding):
+    """Asserts that two pytrees are the same up to ``rounding`` of numbers and of 1."""
+    assert jax.tree.structure(a) == jax.tree.structure(b)
+    for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True):
+        assert (x.dtype, x.shape) == (y.dtype, y.shape)
+        np.testing.assert_allclose(x, y, rtol=rounding, atol=rounding)
+
+
 @pytest.mark.parametrize("name", list(pairs("float32")))
-def test_draws_and_densities_agree_to_the_bit(name, dtype, equal, key):
+def test_draws_and_densities_agree(name, dtype, equal, key):
     own, other = pairs(dtype)[name]
     keys = jax.random.split(key, 200)
 
-    def all_of(d):
-        def one(key):
-            x = d.sample(seed=key)
-            return x, d.log_prob(x), D.log_density(d, x, "mode"), D.mode(d)
+    def draws_of(d):
+        return jax.jit(jax.vmap(lambda key: d.sample(seed=key)))(keys)
 
-        return jax.jit(jax.vmap(one))(keys)
+    def densities_of(d):
+        of = jax.vmap(lambda x: (d.log_prob(x), D.log_density(d, x, "mode"), D.mode(d)))
+        return jax.jit(of)(draws)
 
     with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):  # of distrax's
-        equal(all_of(own), all_of(other))
+        draws = draws_of(own)
+        close(draws, draws_of(other), 4 * jnp.finfo(dtype).eps)
+        equal(densities_of(own), densities_of(other))
         assert own.batch_shape == other.batch_shape and own.event_shape == other.event_shape
         assert own.dtype == other.dtype
 
@@ -116,8 +126,8 @@ class Distrax(types.SimpleNamespace):
 @pytest.mark.parametrize(
     "name", mark_long(SYSTEMS, *(SYSTEMS.keys() - {"ferry", "landing", "walk1d"}))
 )
-def test_every_system_runs_on_either(name, equal, key, monkeypatch):
-    """Its episodes are the same to the bit."""
+def test_every_system_runs_on_either(name, key, monkeypatch):
+    """Its episodes are the same up to rounding, which some of them amplify."""
 
     def episodes():
         jax.clear_caches()  # programs are known by their functions, which stay the same
@@ -140,7 +150,7 @@ def test_every_system_runs_on_either(name, equal, key, monkeypatch):
                 monkeypatch.setattr(module, attribute, getattr(distrax, attribute))
                 seen.append(attribute)
     assert {"D", "Normal", "Uniform", "Categorical", "MultivariateNormalDiag"} <= set(seen)
-    equal(own, episodes())
+    close(own, episodes(), 1e-4)
     jax.clear_caches()
 
 

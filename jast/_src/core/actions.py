@@ -14,6 +14,7 @@ import numpy as np
 
 from jast import distributions as D
 from jast._src.core.typing import Array, ArrayTree, DistributionLike, Numeric, PRNGKey
+from jast._src.distributions import fine_draws
 from jast._src.distributions.normal_tails import normal_score
 from jast._src.runtime._jax import is_traced
 from jast._src.util.checks import check_numbers, wrong
@@ -245,7 +246,7 @@ class Wide(_OfTheModel):
         """One disturbance by this choice of actions, where ``dist`` is the disturbance model at the
         state.
         """
-        return self.of_normal(_like(jax.random.normal, key, dist), dist)
+        return self.of_normal(_like(fine_draws.normal, key, dist), dist)
 
     def draw_start(self, key: PRNGKey, dist: Any) -> Any:
         """Likewise x0; drawn from its own distribution where that has no quantile function."""

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 from jax.lax import lgamma
 
 from jast._src.core.typing import Array, ArrayTree, Numeric, PRNGKey
+from jast._src.distributions import fine_draws
 from jast._src.distributions.base import Elementwise, broadcast, float_array, parameter_array
 from jast._src.distributions.normal import Symmetric
 from jast._src.distributions.tables import numbers
@@ -31,7 +32,7 @@ class Laplace(Symmetric):
     """
 
     def _sample_n(self, key: PRNGKey, n: int) -> Any:
-        return self.loc[None] + self.scale[None] * jax.random.laplace(key, **self._like_n(n))
+        return self.loc[None] + self.scale[None] * fine_draws.laplace(key, **self._like_n(n))
 
     def log_prob(self, value: Any) -> Array:
         return -jnp.abs(self._standardize(value)) - math.log(2.0) - jnp.log(self._scale)
@@ -55,9 +56,7 @@ class Logistic(Symmetric):
     """
 
     def _sample_n(self, key: PRNGKey, n: int) -> Any:
-        tiny = jnp.finfo(self.dtype).tiny
-        u = jax.random.uniform(key, **self._like_n(n), minval=tiny, maxval=1.0)
-        return self._placed(jnp.log(u) - jnp.log1p(-u))
+        return self._placed(fine_draws.logistic(key, **self._like_n(n)))
 
     def log_prob(self, value: Any) -> Array:
         v = self._standardize(value)

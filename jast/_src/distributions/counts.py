@@ -15,6 +15,7 @@ from jax.lax import lgamma, stop_gradient
 from jax.scipy.special import betainc, gammainc, gammaincc, xlog1py
 
 from jast._src.core.typing import Array, Numeric, PRNGKey
+from jast._src.distributions import fine_draws
 from jast._src.distributions.base import Elementwise, parameter_array
 from jast._src.distributions.continuous import log_power
 from jast._src.distributions.family_table import register
@@ -70,7 +71,7 @@ class _Counts(Elementwise):
     def _sample_n(self, key: PRNGKey, n: int) -> Any:
         # JAX's own draws of some families are for Threefry's keys alone
         return self._from_normal(
-            jax.random.normal(key, (n, *self.batch_shape), self._parameter.dtype)
+            fine_draws.normal(key, (n, *self.batch_shape), self._parameter.dtype)
         )
 
     def _from_normal(self, z):

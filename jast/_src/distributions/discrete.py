@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 
 from jast._src.core.typing import Array, Numeric, PRNGKey
+from jast._src.distributions import fine_draws
 from jast._src.distributions.base import Distribution, float_array, parameter_array
 
 __all__ = ["Bernoulli", "Categorical"]
@@ -78,8 +79,7 @@ class Bernoulli(_Choice):
         return jnp.log(self._probs) - jnp.log(1 - self._probs)
 
     def _sample_n(self, key: PRNGKey, n: int) -> Any:
-        p = self.probs
-        return (jax.random.uniform(key, (n, *p.shape), p.dtype) < p[None]).astype(self._dtype)
+        return fine_draws.bernoulli(key, self.probs, n).astype(self._dtype)
 
     def log_prob(self, value: Any) -> Array:
         if self._logits is None:
@@ -143,8 +143,7 @@ class Categorical(_Choice):
     def _sample_n(self, key: PRNGKey, n: int) -> Any:
         logits, p = self.logits, self.probs
         valid = jnp.all(jnp.isfinite(p), axis=-1) & jnp.all(p >= 0, axis=-1)
-        draws = jax.random.categorical(key, logits, axis=-1, shape=(n, *logits.shape[:-1]))
-        draws = draws.astype(self._dtype)
+        draws = fine_draws.categorical(key, logits, n).astype(self._dtype)
         return jnp.where(valid[None], draws, jnp.ones_like(draws) * -1)
 
     def log_prob(self, value: Any) -> Array:

@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 
 from jast._src.core.typing import Array, ArrayTree, Numeric, PRNGKey
+from jast._src.distributions import fine_draws
 from jast._src.distributions.base import Elementwise, broadcast, float_array, parameter_array
 from jast._src.distributions.continuous import log_power
 from jast._src.distributions.family_table import register, register_both
@@ -40,7 +41,7 @@ class LogNormal(LocationScale):
     """
 
     def _sample_n(self, key: PRNGKey, n: int) -> Any:
-        return jnp.exp(self._placed(jax.random.normal(key, **self._like_n(n))))
+        return jnp.exp(self._placed(fine_draws.normal(key, **self._like_n(n))))
 
     def log_prob(self, value: Any) -> Array:
         possible = value > 0
@@ -84,7 +85,7 @@ class Exponential(Elementwise):
         self.rate: jax.Array = parameter_array("Exponential: rate", rate)
 
     def _sample_n(self, key: PRNGKey, n: int) -> Any:
-        return jax.random.exponential(key, (n, *self.rate.shape), self.rate.dtype) / self.rate[None]
+        return fine_draws.exponential(key, (n, *self.rate.shape), self.rate.dtype) / self.rate[None]
 
     def log_prob(self, value: Any) -> Array:
         return jnp.where(value < 0, -jnp.inf, jnp.log(self.rate) - self.rate * value)
@@ -115,7 +116,7 @@ class Gumbel(LocationScale):
     """
 
     def _sample_n(self, key: PRNGKey, n: int) -> Any:
-        return self._placed(jax.random.gumbel(key, **self._like_n(n)))
+        return self._placed(fine_draws.gumbel(key, **self._like_n(n)))
 
     def log_prob(self, value: Any) -> Array:
         v = self._standardize(value)
@@ -160,7 +161,7 @@ class Weibull(Elementwise):
 
     def _sample_n(self, key: PRNGKey, n: int) -> Any:
         k, scale = self.concentration, self.scale
-        e = jax.random.exponential(key, (n, *k.shape), jnp.result_type(k, scale))
+        e = fine_draws.exponential(key, (n, *k.shape), jnp.result_type(k, scale))
         return scale[None] * e ** (1 / k[None])
 
     def log_prob(self, value: Any) -> Array:
@@ -217,7 +218,7 @@ class TruncatedNormal(LocationScale):
         return a, b, below + log_one_less(jnp.minimum(above - below, 0))
 
     def _sample_n(self, key: PRNGKey, n: int) -> Any:
-        z = jax.random.normal(key, **self._like_n(n))
+        z = fine_draws.normal(key, **self._like_n(n))
         return jax.vmap(lambda z: _cut(self, *log_tails(z)))(z)
 
     def log_prob(self, value: Any) -> Array:

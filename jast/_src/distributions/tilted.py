@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 
 from jast._src.core.typing import Array, ArrayTree, DistributionLike, PRNGKey
+from jast._src.distributions import fine_draws
 from jast._src.distributions.base import Wrapped
 from jast._src.distributions.family_table import row
 from jast._src.distributions.flat_rows import filled
@@ -35,7 +36,7 @@ class Tilted(Wrapped):
         self._mean, self._deviation = mean, deviation
 
     def _sample_n(self, key: PRNGKey, n: int) -> Any:
-        z = self._mean[None] + self._deviation[None] * jax.random.normal(
+        z = self._mean[None] + self._deviation[None] * fine_draws.normal(
             key, (n, *self._mean.shape), self._mean.dtype
         )
         return jax.vmap(lambda z: from_normal(self._distribution, z))(z)

@@ -15,6 +15,7 @@ from jast import distributions as D
 from jast._src.core import actions as choices
 from jast._src.core.policy import Policy
 from jast._src.core.typing import ArrayTree
+from jast._src.distributions import fine_draws
 from jast._src.distributions.flat_rows import filled
 
 __all__ = [
@@ -54,7 +55,7 @@ def sample(key, steps, offset):
         k = jax.random.fold_in(key, t + offset)
         keys = [k] if len(leaves) == 1 else [jax.random.fold_in(k, i) for i in range(len(leaves))]
         return treedef.unflatten(
-            [jax.random.normal(k, a.shape[1:], a.dtype) for k, a in zip(keys, leaves, strict=True)]
+            [fine_draws.normal(k, a.shape[1:], a.dtype) for k, a in zip(keys, leaves, strict=True)]
         )
 
     z = jax.vmap(step)(jnp.arange(leaves[0].shape[0], dtype=jnp.int32))

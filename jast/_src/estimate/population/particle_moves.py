@@ -20,6 +20,7 @@ import numpy as np
 from jax import lax
 
 from jast._src.core.simulator import Simulator
+from jast._src.distributions import fine_draws
 from jast._src.normal_space.transform import dimension, normal_numbers, outcome_by_level
 from jast._src.runtime.device import block_size
 from jast._src.util.pytrees import index_tree, select_rows
@@ -194,7 +195,7 @@ def _move_on_device(sim, particles, key, rows, size, wide, live, moves, kinds, l
         particles, accepted, invalid = carry
         old = jax.tree.map(lambda a: lax.dynamic_slice_in_dim(a, i * lanes, lanes), particles)
         for_noise, for_window = jax.random.split(jax.random.fold_in(key, i))
-        noise = width * jax.random.normal(for_noise, old.z.shape, old.z.dtype)
+        noise = width * fine_draws.normal(for_noise, old.z.shape, old.z.dtype)
         about = old.z, noise, for_window, size.astype(old.z.dtype), old.reached
         z = lax.switch(kind, by_kind, *about)
         o, reached = play(z)

@@ -9,6 +9,7 @@ import numpy as np
 
 from jast._src.core.counter_prng import counter_key, numpy_generator
 from jast._src.core.simulator import Simulator
+from jast._src.distributions import fine_draws
 from jast._src.estimate.gaussians.mixture_fit import log_sum, with_log_shares
 from jast._src.normal_space import transform
 from jast._src.normal_space.evaluate_points import evaluate_points, lanes_of
@@ -89,7 +90,7 @@ def plain_parts(key, i, n, sim):
 
 @partial(jax.jit, static_argnums=(1, 2, 3))
 def _normals(key, n, d, dtype):
-    return jax.random.normal(key, (n, d), dtype)
+    return fine_draws.normal(key, (n, d), dtype)
 
 
 def rows_of(sim):
