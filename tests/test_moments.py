@@ -2,6 +2,8 @@
 NumPy, and the answers that they lead to.
 """
 
+import re
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -29,7 +31,7 @@ from jast._src.normal_space import transform
 from jast._src.normal_space.evaluate_points import evaluate_points
 from jast._src.normal_space.moments import distances, slopes
 from jast.blackbox import from_python
-from jast.distributions import MultivariateNormalDiag
+from jast.distributions import MultivariateNormalDiag, Normal
 from jast.estimate import failure_probability
 from jast.simulators import limit_state
 
@@ -202,6 +204,34 @@ def test_where_half_spaces_do_not_serve_populations_tell_about(g, numbers, truth
     assert all(p.plain[2] >= 60 and p.guaranteed[1] > truth for p in found)
     for p in found:  # their failures are kept
         assert evaluate_points(sim, p.proposal.points).failure.all() and len(p.proposal.points)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("bound, budget", [(52.0, 600), (52.0, 2000), (60.0, 2000)])
+def test_common_failures_are_left_to_plain_draws(bound, budget):
+    """Failures of a tenth and of a fiftieth, which no half-space tells: once a population or the
+    first draws say so, what is left of the budget, half of it at least, is drawn plainly.
+    """
+    truth = chi2.sf(bound, 40)
+    sim = limit_state(lambda z: bound - jnp.sum(z**2), 40)
+    found = [failure_probability(jax.random.key(k), sim, budget) for k in range(4)]
+    plain = [p for p in found if p.samples == p.plain[2] >= budget / 2]
+    assert len(plain) >= 3 and all(p.reliable for p in plain)
+    assert all(abs(p.mean / truth - 1) < 4 * p.relative_error < 1.3 for p in plain)
+    assert all(p.evaluations <= budget for p in found)
+
+
+@pytest.mark.slow
+def test_the_bar_of_a_black_box_moves_with_all_of_its_runs(capsys):
+    def run(z):
+        left = 52.0 - float(np.sum(z**2))
+        return left <= 0, max(left, 0.0)
+
+    sim = from_python(run, horizon=40, disturbance=Normal(0.0, 1.0))
+    failure_probability(jax.random.key(0), sim, 400, progress=True)
+    bars = capsys.readouterr().err.split("\r")
+    shown = [int(m.group(1)) for b in bars if (m := re.search(r"(\d+)/400 .*failures=\d", b))]
+    assert len(shown) > 2 and min(shown) < 100 and 300 < max(shown) <= 400
 
 
 @pytest.mark.slow

@@ -4,6 +4,7 @@ methods beside it.
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Sequence
 from functools import partial
 
@@ -26,7 +27,8 @@ from jast._src.normal_space import transform
 from jast._src.runtime import work
 from jast._src.runtime._jax import briefly
 from jast._src.runtime.checkpoints import keep_answers, open_checkpoint
-from jast._src.runtime.host_errors import runs_on_host
+from jast._src.runtime.host_errors import runs_made, runs_on_host, telling_runs
+from jast._src.runtime.progress_bar import Watch
 from jast._src.util.checks import check_random_key, whole_number, wrong
 from jast._src.util.display import call_settings
 from jast._src.util.intervals import checked_level
@@ -147,7 +149,7 @@ def failure_probability(
         gradients: differentiate the miss distance. Where its gradients lead nowhere, nothing
             depends on them.
         level: of the interval, in (0, 1).
-        progress: whether to show a progress bar.
+        progress: whether to show a progress bar: of the runs of a black box, else of the last part.
         callback: called as ``callback(done, total, None)`` after each chunk of the last part.
         checkpoint: a folder that keeps finished units of the work. The same call then goes on where
             it was stopped, to the same result.
@@ -226,7 +228,12 @@ def failure_probability(
                 **about,
                 otherwise=populations if serve else None,
             )
-            found = estimate_by_proposal(wanted)
+            if progress and runs_on_host(sim) and executor is None:
+                wanted = wanted._replace(watched=(False, callback))
+                with _bar_of_runs(name, sim, budget):
+                    found = estimate_by_proposal(wanted)
+            else:
+                found = estimate_by_proposal(wanted)
             found = flag_imprecise(found) if budget >= MIN_BUDGET else found
     found = found._replace(settings=settings)
     while by_default and not few and (budget := budgets.next_budget(found, budget)) is not None:
@@ -246,6 +253,20 @@ def failure_probability(
         said = f"{found.evaluations} evaluations were too few: {found.relative_error:.1%}"
         found = again._replace(history=(said, *again.history))
     return found
+
+
+@contextlib.contextmanager
+def _bar_of_runs(name, sim, budget):
+    """A bar that moves with every batch of runs of a black box, with how many of them failed."""
+    made, failures = runs_made(sim), 0
+
+    def tell(failing):
+        nonlocal failures
+        failures += failing
+        watch.reach(min(runs_made(sim) - made, budget), failures=failures)
+
+    with Watch(name, budget, "run", True, None) as watch, telling_runs(sim, tell):
+        yield
 
 
 def adaptive_cross_entropy(

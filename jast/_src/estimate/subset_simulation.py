@@ -160,11 +160,18 @@ def estimate_from_replicates(
 
 
 def fallback_estimate(
-    key: jax.Array, sim: Simulator, budget: int, log_mean: float, level: float, reasons: list[str]
+    key: jax.Array,
+    sim: Simulator,
+    budget: int,
+    log_mean: float,
+    level: float,
+    reasons: list[str],
+    plain_failures: int,
 ) -> Estimate | None:
     """The `Estimate` of a few populations within ``budget``, where ``log_mean`` is about
     what they will find; None where the budget is too small. If the first one reaches no failure
-    with half of the budget, there are no others, and the mean is NaN.
+    with half of the budget, there are no others, and the mean is NaN. Nor are there where it says
+    that ``plain_failures`` of as many draws of the model as are left fail.
     """
     rounds = np.clip(log_mean, MIN_LOG_PROBABILITY, 0.0) / math.log(LEVEL_SHARE) + 2
     enough = budget / FALLBACK_REPLICATES / rounds >= MIN_SAMPLES
@@ -179,9 +186,10 @@ def fallback_estimate(
         most = left if i == replicates - 1 else left // 2
         about = dict(min_log_probability=MIN_LOG_PROBABILITY, max_evaluations=most)
         runs.append(explore(k, sim, size, final_moves=0, patience=PATIENCE, **about))
-        if not runs[0].reached:
-            break
         left -= runs[-1].evaluations
+        often = math.exp(runs[0].log_mean) * left >= plain_failures
+        if not runs[0].reached or (often and i == 0):
+            break
         rounds = MORE_ROUNDS * runs[-1].evaluations / size
     sizes = ", ".join(str(r.plain[2]) for r in runs)
     said = f"this is the answer of subset simulation, populations of {sizes}"

@@ -153,7 +153,7 @@ def _draw_few(request, search, reasons):
     if search.suffices or state.log_p > -math.inf:
         return _draw(request, search, reasons)
     n = max((request.budget - state.spent) // 2, 1)
-    found, state = _draw_populations(request, state, n, -math.log(n), reasons)
+    found, state = _draw_populations(request, search, n, -math.log(n), reasons)
     plain = _draw(request, search._replace(state=state), reasons)
     if found is None or plain.reliable:
         return plain
@@ -167,12 +167,15 @@ def _draw_few(request, search, reasons):
     )
 
 
-def _draw_populations(request, state, n, log_mean, reasons):
+def _draw_populations(request, search, n, log_mean, reasons):
     """(The `Estimate` of a few populations with ``n`` evaluations, the state after them): None
     where they are too few, or the populations reach no failure.
     """
+    state = search.state
     against = [*reasons, *state.reasons] or [UNUSABLE]
-    found = fallback_estimate(request.key, request.sim, n, log_mean, request.level, against)
+    enough = search.family.settings.plain_failures
+    about = request.key, request.sim, n, log_mean, request.level, against, enough
+    found = fallback_estimate(*about)
     if found is None:
         return None, state
     found = _after(state, found)
@@ -331,15 +334,17 @@ def _draw(request, search, reasons):
     f, state = search
     name, key, sim, level = request.name, request.key, request.sim, request.level
     n = max(request.budget - state.spent, 1)  # a search of many parts may have spent all
-    often = math.exp(min(state.log_p, 0.0)) * n >= request.settings.plain_failures
+    enough = f.settings.plain_failures
+    often = math.exp(min(state.log_p, 0.0)) * n >= enough
     about_proposal = [*reasons, *state.reasons]
     if not (search.suffices or often) and request.otherwise and _has_many_steps(request):
         return _after(state, request.otherwise(n))
     if not (search.suffices or often) and state.log_p > -math.inf:
-        found, state = _draw_populations(request, state, n, state.log_p, reasons)
-        if found is not None:
-            return found
+        found, state = _draw_populations(request, search, n, state.log_p, reasons)
         search, n = search._replace(state=state), max(request.budget - state.spent, 1)
+        often = found is not None and math.exp(found.log_mean) * n >= enough
+        if not (found is None or often):
+            return found
     watch = Watch(name, n, "episode", *request.watched)
     if search.suffices or (search.efficiency and not often):
         against = about_proposal if search.suffices else [*about_proposal, UNUSABLE]

@@ -99,8 +99,12 @@ class SearchState(NamedTuple):
 
     @property
     def log_p(self) -> float:
-        """Log of the probability, as far as anything tells; -inf where no failure was seen."""
-        return max(self.log_mean, *(p.log_mean for p in self.populations), -math.inf)
+        """Log of the probability, as far as anything tells; -inf where no failure was seen. A
+        single failure of the model may be chance.
+        """
+        failing, _, drawn = self.plain
+        plain = math.log(failing / drawn) if failing > 1 else -math.inf
+        return max(self.log_mean, *(p.log_mean for p in self.populations), plain)
 
     def note(self, text: str, evaluations: int = 0) -> SearchState:
         """The state with a line of history, and what it cost."""
