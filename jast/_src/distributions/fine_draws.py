@@ -88,8 +88,8 @@ def _with_tails(
     first: Callable[[Array], Array],
     last: Callable[[Array], Array],
 ) -> Array:
-    """``x``, drawn with ``key``, where neither the words nor those of the other end are few; else
-    ``first`` or ``last`` of the part of the words up to there.
+    """``x``, which was drawn with ``key``; where its word is among the outermost, ``first`` or
+    ``last`` of the part of all words that lies beyond it.
     """
     if x.dtype != jnp.float32:
         return x
