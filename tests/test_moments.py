@@ -23,9 +23,10 @@ from jast._src.estimate.gaussians.mixture_fit import (
 )
 from jast._src.estimate.gaussians.moments import explore_moments
 from jast._src.estimate.host_populations import draw_wide, wide_enough
+from jast._src.estimate.proposal_search import by_proposal
 from jast._src.estimate.proposal_search.audit import FORGOTTEN, audit_proposal
 from jast._src.estimate.proposal_search.mixture_draws import random_numbers
-from jast._src.estimate.proposal_search.search_state import search_context
+from jast._src.estimate.proposal_search.search_state import SearchState, search_context
 from jast._src.estimate.proposal_search.settings import FEW_RUNS
 from jast._src.normal_space import transform
 from jast._src.normal_space.evaluate_points import evaluate_points
@@ -219,6 +220,22 @@ def test_common_failures_are_left_to_plain_draws(bound, budget):
     assert len(plain) >= 3 and all(p.reliable for p in plain)
     assert all(abs(p.mean / truth - 1) < 4 * p.relative_error < 1.3 for p in plain)
     assert all(p.evaluations <= budget for p in found)
+
+
+@pytest.mark.slow
+def test_populations_are_made_once_and_their_draws_counted_once():
+    """Where no failure was seen, half of what is left is for them, whatever they see."""
+    sim = limit_state(lambda z: 63.7 - jnp.sum(z**2), 40)
+    f = GaussianFamily(sim, 2000, search_context(jax.random.key(0)), FEW_RUNS, "moments")
+    request = by_proposal.Request("few", jax.random.key(0), sim, 2000)
+    search = by_proposal.Search(f, SearchState(spent=100, plain=(0, 0, 30)))
+    p = by_proposal._draw_few(request, search, [])
+    populations = [h for h in p.history if h.startswith("population")]
+    assert len(populations) == 3 and p.evaluations == 2000
+    sizes = re.search(r"populations of (\d+), (\d+), (\d+)", " ".join(p.warnings)).groups()
+    of_populations = sum(int(re.search(r"(\d+) evaluations", h).group(1)) for h in populations)
+    last = 2000 - 100 - of_populations
+    assert p.plain[2] == 30 + sum(map(int, sizes)) + last
 
 
 @pytest.mark.slow

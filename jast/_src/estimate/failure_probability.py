@@ -149,7 +149,8 @@ def failure_probability(
         gradients: differentiate the miss distance. Where its gradients lead nowhere, nothing
             depends on them.
         level: of the interval, in (0, 1).
-        progress: whether to show a progress bar: of the runs of a black box, else of the last part.
+        progress: whether to show a progress bar: of the runs of a black box where there is no
+            executor, else of the last part.
         callback: called as ``callback(done, total, None)`` after each chunk of the last part.
         checkpoint: a folder that keeps finished units of the work. The same call then goes on where
             it was stopped, to the same result.

@@ -154,8 +154,8 @@ def _draw_few(request, search, reasons):
         return _draw(request, search, reasons)
     n = max((request.budget - state.spent) // 2, 1)
     found, state = _draw_populations(request, search, n, -math.log(n), reasons)
-    plain = _draw(request, search._replace(state=state), reasons)
-    if found is None or plain.reliable:
+    plain = _draw(request, search._replace(state=state), reasons, populations=False)
+    if found is None or plain.reliable or not math.isfinite(found.relative_error):
         return plain
     counts = tuple(a + b for a, b in zip(found.plain, plain.plain, strict=True))
     return found._replace(
@@ -327,9 +327,9 @@ def _draw_moments(request, search, reasons):
     return add_lines(found, lines)
 
 
-def _draw(request, search, reasons):
+def _draw(request, search, reasons, populations=True):
     """The `Estimate` of what is left of the budget; ``reasons``: against it, whatever the search
-    found: by the proposal, by a few populations or by plain draws.
+    found: by the proposal, by a few ``populations`` or by plain draws.
     """
     f, state = search
     name, key, sim, level = request.name, request.key, request.sim, request.level
@@ -339,7 +339,7 @@ def _draw(request, search, reasons):
     about_proposal = [*reasons, *state.reasons]
     if not (search.suffices or often) and request.otherwise and _has_many_steps(request):
         return _after(state, request.otherwise(n))
-    if not (search.suffices or often) and state.log_p > -math.inf:
+    if populations and not (search.suffices or often) and state.log_p > -math.inf:
         found, state = _draw_populations(request, search, n, state.log_p, reasons)
         search, n = search._replace(state=state), max(request.budget - state.spent, 1)
         often = found is not None and math.exp(found.log_mean) * n >= enough
