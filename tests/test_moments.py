@@ -11,7 +11,7 @@ import pytest
 from scipy.stats import chi2, multivariate_normal, norm, truncnorm
 
 import jast
-from benchmarks.few_calls import SlowLane, any_far, energy, plane, planes, slow_lane
+from benchmarks.few_calls import SlowLane, any_far, energy, of_40, plane, planes, slow_lane
 from benchmarks.first_minute import lane
 from jast._src.estimate.gaussians import half_spaces
 from jast._src.estimate.gaussians.family import GaussianFamily
@@ -214,7 +214,7 @@ def test_common_failures_are_left_to_plain_draws(bound, budget):
     first draws say so, what is left of the budget, half of it at least, is drawn plainly.
     """
     truth = chi2.sf(bound, 40)
-    sim = limit_state(lambda z: bound - jnp.sum(z**2), 40)
+    sim = of_40(energy, bound)
     found = [failure_probability(jax.random.key(k), sim, budget) for k in range(4)]
     plain = [p for p in found if p.samples == p.plain[2] >= budget / 2]
     assert len(plain) >= 3 and all(p.reliable for p in plain)
@@ -225,7 +225,7 @@ def test_common_failures_are_left_to_plain_draws(bound, budget):
 @pytest.mark.slow
 def test_populations_are_made_once_and_their_draws_counted_once():
     """Where no failure was seen, half of what is left is for them, whatever they see."""
-    sim = limit_state(lambda z: 63.7 - jnp.sum(z**2), 40)
+    sim = of_40(energy, 63.7)
     f = GaussianFamily(sim, 2000, search_context(jax.random.key(0)), FEW_RUNS, "moments")
     request = by_proposal.Request("few", jax.random.key(0), sim, 2000)
     search = by_proposal.Search(f, SearchState(spent=100, plain=(0, 0, 30)))

@@ -126,12 +126,14 @@ def test_paths_keep_to_their_budget_nearly(budget):
     assert budget or found == 1  # 3 degrees apart: all alike
 
 
+TELLS_TWO = pytest.mark.xfail(strict=False, reason="of keys 0 to 5 the one that tells two modes")
+
+
 @pytest.mark.long
-@pytest.mark.parametrize("seed", [0, 2, 3])
+@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=TELLS_TWO), 2, 3])
 def test_the_ferry_has_one_failure_mode(seed):
     """Turn hard towards the ferry's way, then straighten: of all its likely failures the cosines
-    are above .78, and straight paths between them miss the ferry by less than .4 of 5. With key 1
-    no path between two groups is found: of keys 0 to 5 the only one.
+    are above .78, and straight paths between them miss the ferry by less than .4 of 5.
     """
     report = jast.stress(jax.random.key(seed), jast.simulators.ferry(), 3 * 2**19)
     assert len(report.modes) == 1 and report.spent["telling modes apart"] <= 2.1 * 25_000

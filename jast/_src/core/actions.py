@@ -401,7 +401,7 @@ def _as(dtype, *values):
 
 
 def _like(draw: Callable[..., jax.Array], key: PRNGKey, dist: DistributionLike) -> Any:
-    """Numbers by ``draw`` of `jax.random` in the shape of a value of ``dist``, one independent
+    """Numbers by ``draw(key, shape, dtype)`` in the shape of a value of ``dist``, one independent
     stream a leaf.
     """
     leaves, treedef = jax.tree.flatten(D.event_like(dist))

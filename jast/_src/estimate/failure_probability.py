@@ -4,7 +4,6 @@ methods beside it.
 
 from __future__ import annotations
 
-import contextlib
 from collections.abc import Sequence
 from functools import partial
 
@@ -27,7 +26,7 @@ from jast._src.normal_space import transform
 from jast._src.runtime import work
 from jast._src.runtime._jax import briefly
 from jast._src.runtime.checkpoints import keep_answers, open_checkpoint
-from jast._src.runtime.host_errors import runs_made, runs_on_host, telling_runs
+from jast._src.runtime.host_errors import runs_on_host, showing_runs
 from jast._src.runtime.progress_bar import Watch
 from jast._src.util.checks import check_random_key, whole_number, wrong
 from jast._src.util.display import call_settings
@@ -231,7 +230,7 @@ def failure_probability(
             )
             if progress and runs_on_host(sim) and executor is None:
                 wanted = wanted._replace(watched=(False, callback))
-                with _bar_of_runs(name, sim, budget):
+                with Watch(name, budget, "run", progress, None) as watch, showing_runs(sim, watch):
                     found = estimate_by_proposal(wanted)
             else:
                 found = estimate_by_proposal(wanted)
@@ -254,20 +253,6 @@ def failure_probability(
         said = f"{found.evaluations} evaluations were too few: {found.relative_error:.1%}"
         found = again._replace(history=(said, *again.history))
     return found
-
-
-@contextlib.contextmanager
-def _bar_of_runs(name, sim, budget):
-    """A bar that moves with every batch of runs of a black box, with how many of them failed."""
-    made, failures = runs_made(sim), 0
-
-    def tell(failing):
-        nonlocal failures
-        failures += failing
-        watch.reach(min(runs_made(sim) - made, budget), failures=failures)
-
-    with Watch(name, budget, "run", True, None) as watch, telling_runs(sim, tell):
-        yield
 
 
 def adaptive_cross_entropy(

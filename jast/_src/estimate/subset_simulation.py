@@ -187,8 +187,8 @@ def fallback_estimate(
         about = dict(min_log_probability=MIN_LOG_PROBABILITY, max_evaluations=most)
         runs.append(explore(k, sim, size, final_moves=0, patience=PATIENCE, **about))
         left -= runs[-1].evaluations
-        often = math.exp(runs[0].log_mean) * left >= plain_failures
-        if not runs[0].reached or (often and i == 0):
+        often = math.exp(runs[-1].log_mean) * left >= plain_failures
+        if i == 0 and (often or not runs[-1].reached):
             break
         rounds = MORE_ROUNDS * runs[-1].evaluations / size
     sizes = ", ".join(str(r.plain[2]) for r in runs)

@@ -13,7 +13,7 @@ from jast._src.core.episode import Episode, play_chosen, replay
 from jast._src.core.rewards import log_likelihood
 from jast._src.core.simulator import Simulator, require_simulator
 from jast._src.core.typing import PRNGKey
-from jast._src.runtime.host_errors import runs_made, runs_on_host, telling_runs
+from jast._src.runtime.host_errors import runs_on_host, showing_runs
 from jast._src.runtime.progress_bar import Watch
 from jast._src.util import checks, display
 from jast._src.util.intervals import checked_level, clopper_pearson
@@ -151,11 +151,8 @@ def criticality(
         watch.reach(min(int(at[0]) + size, len(rows)))
         return found
 
-    def tell(failing):
-        watch.reach(min(runs_made(sim) - made, len(rows)))
-
-    at, made = np.arange(len(rows), dtype=np.int32), runs_made(sim)
-    with Watch(name, len(rows), "sim", progress, None) as watch, telling_runs(sim, tell):
+    at = np.arange(len(rows), dtype=np.int32)
+    with Watch(name, len(rows), "sim", progress, None) as watch, showing_runs(sim, watch):
         ended, wrong = map_in_lanes(size, lanes, at, rows)
     failing, invalid = np.bincount(rows[ended], minlength=steps + 1), int(wrong.sum())
     p = failing / draws

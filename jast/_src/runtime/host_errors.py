@@ -30,6 +30,7 @@ __all__ = [
     "runs_made",
     "runs_on_host",
     "seconds_of_runs",
+    "showing_runs",
     "telling_runs",
 ]
 
@@ -195,6 +196,22 @@ def telling_runs(sim, told):
     the number of failing ones in it.
     """
     return _all_of(host.tell_runs(told) for host in hosts_of(sim))
+
+
+@contextlib.contextmanager
+def showing_runs(sim, watch):
+    """A context in which the bar of ``watch`` moves with every batch of runs of a black box, with
+    how many of them failed.
+    """
+    made, failures = runs_made(sim), 0
+
+    def tell(failing):
+        nonlocal failures
+        failures += failing
+        watch.reach(min(runs_made(sim) - made, watch.total), failures=failures)
+
+    with telling_runs(sim, tell):
+        yield
 
 
 @contextlib.contextmanager

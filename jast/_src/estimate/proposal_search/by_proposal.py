@@ -154,7 +154,7 @@ def _draw_few(request, search, reasons):
         return _draw(request, search, reasons)
     n = max((request.budget - state.spent) // 2, 1)
     found, state = _draw_populations(request, search, n, -math.log(n), reasons)
-    plain = _draw(request, search._replace(state=state), reasons, populations=False)
+    plain = _draw_plainly(request, search._replace(state=state), reasons)
     if found is None or plain.reliable or not math.isfinite(found.relative_error):
         return plain
     counts = tuple(a + b for a, b in zip(found.plain, plain.plain, strict=True))
@@ -172,10 +172,15 @@ def _draw_populations(request, search, n, log_mean, reasons):
     where they are too few, or the populations reach no failure.
     """
     state = search.state
-    against = [*reasons, *state.reasons] or [UNUSABLE]
-    enough = search.family.settings.plain_failures
-    about = request.key, request.sim, n, log_mean, request.level, against, enough
-    found = fallback_estimate(*about)
+    found = fallback_estimate(
+        request.key,
+        request.sim,
+        n,
+        log_mean,
+        request.level,
+        reasons=[*reasons, *state.reasons] or [UNUSABLE],
+        plain_failures=search.family.settings.plain_failures,
+    )
     if found is None:
         return None, state
     found = _after(state, found)
@@ -327,36 +332,43 @@ def _draw_moments(request, search, reasons):
     return add_lines(found, lines)
 
 
-def _draw(request, search, reasons, populations=True):
+def _draw(request, search, reasons):
     """The `Estimate` of what is left of the budget; ``reasons``: against it, whatever the search
-    found: by the proposal, by a few ``populations`` or by plain draws.
+    found: by the proposal, by a few populations or by plain draws.
     """
     f, state = search
-    name, key, sim, level = request.name, request.key, request.sim, request.level
     n = max(request.budget - state.spent, 1)  # a search of many parts may have spent all
     enough = f.settings.plain_failures
     often = math.exp(min(state.log_p, 0.0)) * n >= enough
-    about_proposal = [*reasons, *state.reasons]
     if not (search.suffices or often) and request.otherwise and _has_many_steps(request):
         return _after(state, request.otherwise(n))
-    if populations and not (search.suffices or often) and state.log_p > -math.inf:
+    if not (search.suffices or often) and state.log_p > -math.inf:
         found, state = _draw_populations(request, search, n, state.log_p, reasons)
         search, n = search._replace(state=state), max(request.budget - state.spent, 1)
         often = found is not None and math.exp(found.log_mean) * n >= enough
         if not (found is None or often):
             return found
-    watch = Watch(name, n, "episode", *request.watched)
     if search.suffices or (search.efficiency and not often):
-        against = about_proposal if search.suffices else [*about_proposal, UNUSABLE]
+        watch = Watch(request.name, n, "episode", *request.watched)
+        unusable = [] if search.suffices else [UNUSABLE]
+        against = [*reasons, *state.reasons, *unusable]
         return _draw_proposal(request, search, watch, against, f.settings.min_ess)
-    shared = key, sim, f.batch, n
+    return _draw_plainly(request, search, reasons)
+
+
+def _draw_plainly(request, search, reasons):
+    """The `Estimate` of what is left of the budget by draws of the model."""
+    (f, state), key = search, request.key
+    n = max(request.budget - state.spent, 1)
+    watch = Watch(request.name, n, "episode", *request.watched)
+    shared = key, request.sim, f.batch, n
     total, notes, lost = chunks(simulate_points, shared, f.batch, watch, request.placement)
     found = estimate_from_counts(
-        name,
+        request.name,
         total,
         notes=notes,
         reasons=[*reasons, *lost],
-        level=level,
+        level=request.level,
         history=state.history,
         evaluations=state.spent + total.samples,
         proposal=search.proposal,
