@@ -15,6 +15,7 @@ FAMILIES = {
     "laplace": (jax.random.laplace, st.laplace, -1),  # its smallest words are its largest numbers
     "logistic": (None, st.logistic, 1),
     "normal": (jax.random.normal, st.norm, 1),
+    "uniform": (jax.random.uniform, st.uniform, 1),
 }
 LEFT = np.unique(np.geomspace(1, 2**17, 500).astype(np.uint32)) - np.uint32(1)
 
@@ -50,6 +51,14 @@ def test_all_other_numbers_are_those_of_jax(name, key):
         assert np.array_equal(x[~far], theirs(key, (200_000,), jnp.float32)[~far])
     quantile = family.ppf((words[far] + 0.5) * 2.0**-32)
     assert (np.abs(x[far] - sign * quantile) < 2e-2 * np.abs(quantile)).all()
+
+
+def test_uniform_numbers_have_logarithms_on_either_side(key, monkeypatch):
+    draw_words(monkeypatch, np.array([0, 2**32 - 1], np.uint32))
+    monkeypatch.setattr(jax.random, "uniform", lambda key, shape, dtype: jnp.array([0.0, 1.0]))
+    u = fine_draws.uniform(key, (2,), jnp.float32)
+    assert np.isfinite(jnp.log(u)).all()
+    assert np.isfinite(jnp.log1p(-u)).all()
 
 
 @pytest.mark.parametrize("p", [1e-7, 1e-6, 0.3, 1 - 1e-6, 1.0])

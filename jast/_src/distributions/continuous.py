@@ -92,7 +92,7 @@ class Uniform(Elementwise):
         return self.high - self.low
 
     def _sample_n(self, key: PRNGKey, n: int) -> Any:
-        u = jax.random.uniform(key, (n, *self.batch_shape), self.range.dtype)
+        u = fine_draws.uniform(key, (n, *self.batch_shape), self.range.dtype)
         return self.low[None] + self.range[None] * u
 
     def prob(self, value: Any) -> Array:

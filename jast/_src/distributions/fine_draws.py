@@ -15,7 +15,16 @@ import numpy as np
 
 from jast._src.core.typing import Array, PRNGKey
 
-__all__ = ["bernoulli", "categorical", "exponential", "gumbel", "laplace", "logistic", "normal"]
+__all__ = [
+    "bernoulli",
+    "categorical",
+    "exponential",
+    "gumbel",
+    "laplace",
+    "logistic",
+    "normal",
+    "uniform",
+]
 
 OUTERMOST = 2**17
 """Of the 2^32 words so many on either side: a part of 2^-15. Nearer the middle JAX is off by .4 %
@@ -70,6 +79,13 @@ def logistic(key: PRNGKey, shape: tuple[int, ...], dtype: Any) -> Array:
 def categorical(key: PRNGKey, logits: Array, n: int) -> Array:
     """[n, ...] of ``logits`` [..., k], as `jax.random.categorical`: by Gumbel numbers."""
     return jnp.argmax(gumbel(key, (n, *logits.shape), logits.dtype) + logits[None], axis=-1)
+
+
+def uniform(key: PRNGKey, shape: tuple[int, ...], dtype: Any) -> Array:
+    """As `jax.random.uniform` between 0 and 1, and in float32 neither 0 nor 1."""
+    most = 1 - float(jnp.finfo(dtype).epsneg)
+    u = jax.random.uniform(key, shape, dtype)
+    return _with_tails(key, u, lambda p: p, lambda p: jnp.minimum(1 - p, most))
 
 
 def bernoulli(key: PRNGKey, p: Array, n: int) -> Array:

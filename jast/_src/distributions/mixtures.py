@@ -5,6 +5,7 @@ defensive mixing), and of one distribution moved in its latent normal numbers.
 import jax
 import jax.numpy as jnp
 
+from jast._src.distributions import fine_draws
 from jast._src.distributions.base import Distribution, Wrapped
 from jast._src.distributions.flat_rows import unflat
 from jast._src.distributions.operations import event_like, from_normal, mode, sample
@@ -41,9 +42,8 @@ class Blend(OneByOne):
     def _draw(self, key):
         # the coin is drawn with a key folded from the value's, one hash less than of a split; only
         # one of the draws is seen, so that one key serves all
-        u = jax.random.uniform(
-            jax.random.fold_in(jax.random.clone(key), COIN), (), self._log_weights.dtype
-        )
+        coin = jax.random.fold_in(jax.random.clone(key), COIN)
+        u = fine_draws.uniform(coin, (), self._log_weights.dtype)
         edges = jnp.cumsum(jnp.exp(self._log_weights))[:-1]
         value = sample(self._parts[0], key)
         for part, edge in zip(self._parts[1:], edges, strict=True):

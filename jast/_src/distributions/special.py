@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 
 from jast._src.core.typing import Array, DistributionLike, Numeric, PRNGKey
+from jast._src.distributions import fine_draws
 from jast._src.distributions.base import Distribution, as_key, float_array
 from jast._src.distributions.normal_tails import float_dtype, fraction
 from jast._src.distributions.operations import log_density, mode
@@ -179,7 +180,7 @@ class Tent(Distribution):
         return fraction(*(self._cdf_full(v) for v in (value, self._low, self._high)))
 
     def _sample_n(self, key: PRNGKey, n: int) -> Any:
-        return self.quantile(jax.random.uniform(key, (n, *self.batch_shape), self._center.dtype))
+        return self.quantile(fine_draws.uniform(key, (n, *self.batch_shape), self._center.dtype))
 
     def mode(self) -> Any:
         return self._center
