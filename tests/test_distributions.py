@@ -657,3 +657,27 @@ def test_a_certain_part_is_a_number_that_decides_nothing(key):
     assert found.reliable
     truth = scipy.stats.norm.sf(12 / 8**0.5)
     assert abs(found.mean - truth) < 4 * found.standard_error  # by chance one in 16,000
+
+
+@pytest.mark.parametrize(
+    "make, words",
+    [
+        (lambda: D.Tent(0.5, -1.0), "Tent: width must be at least 0"),
+        (lambda: D.Tent(2.0), "Tent: center must lie between"),
+        (lambda: D.Tent(0.5, 1.0, 1.0, 0.0), "Tent: center must lie between"),
+        (lambda: D.Normal(0.0, float("nan")), "Normal: scale must be at least 0, received nan"),
+        (lambda: D.Bernoulli(probs=float("nan")), "Bernoulli: probs must lie between"),
+    ],
+)
+def test_parameters_that_make_no_distribution(make, words):
+    with pytest.raises(ValueError, match=words):
+        make()
+
+
+@pytest.mark.parametrize("given", [dict(probs=0.2), dict(logits=-1.0), dict(probs=0.0)])
+def test_a_coin_shows_nothing_but_0_and_1(given):
+    coin = D.Bernoulli(**given)
+    others = jnp.asarray([-5, -1, 2, 7])
+    np.testing.assert_array_equal(coin.log_prob(others), -np.inf)
+    both = jnp.exp(coin.log_prob(jnp.asarray([0, 1])))
+    np.testing.assert_allclose(both.sum(), 1, rtol=1e-6)

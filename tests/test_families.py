@@ -177,6 +177,19 @@ def test_a_mixture_is_exact_in_both_tails(dtype, key):
     assert abs(share - expected) < 4 * np.sqrt(expected / 8000)
 
 
+def test_the_mode_of_a_mixture_is_the_likeliest_of_its_parts():
+    """So no value is much likelier than it: its median, where parts lie apart, is among the least
+    likely.
+    """
+    weights = jnp.asarray([[0.3, 0.7], [0.8, 0.2]])
+    each = D.Normal(jnp.asarray([[-2.0, 1.0]] * 2), jnp.asarray([[0.5, 1.0], [0.5, 0.2]]))
+    d = D.MixtureSameFamily(D.Categorical(probs=weights), each)
+    np.testing.assert_array_equal(D.mode(d), [1.0, -2.0])
+    x = jnp.linspace(-5.0, 5.0, 1001)
+    gain = jax.vmap(lambda x: D.log_density(d, jnp.full(2, x), "mode"))(x)
+    assert gain.max() < 0.01
+
+
 def _pair(mean):
     pair = D.Normal(jnp.stack([0.0 * mean, mean]), jnp.asarray([1.0, 0.5]))
     return D.MixtureSameFamily(D.Categorical(probs=jnp.asarray([0.7, 0.3])), pair)

@@ -184,12 +184,16 @@ def parameter_array(name: str, x: Any, low: Any = 0, high: float = np.inf) -> An
         ValueError: where it is known, and some of it lies outside of [low, high].
     """
     array = float_array(x)
-    if not is_traced(array, low):
+    if not is_traced(array, low, high):
         dtypes = [a.dtype for a in (array, low) if hasattr(a, "dtype")]
         coarse = min(dtypes, key=lambda dtype: dtype.itemsize)  # in which equal numbers are equal
         known = np.asarray(array, coarse)
-        if ((known < np.asarray(low, coarse)) | (known > high)).any():
-            words = f"lie between {low} and {high}" if high < np.inf else f"be at least {low}"
+        if not ((known >= np.asarray(low, coarse)) & (known <= high)).all():  # of NaN neither is
+            words = (
+                f"lie between {low} and {high}"
+                if np.all(np.isfinite(high))
+                else f"be at least {low}"
+            )
             raise ValueError(f"{name} must {words}, received {x}")
     return array
 

@@ -87,7 +87,8 @@ class Bernoulli(_Choice):
         else:
             log_0, log_1 = -jax.nn.softplus(self._logits), -jax.nn.softplus(-1.0 * self._logits)
         one = jnp.asarray(value).astype(log_1.dtype)
-        return _times(log_0, 1 - one) + _times(log_1, one)
+        log_p = _times(log_0, 1 - one) + _times(log_1, one)
+        return jnp.where((one == 0) | (one == 1), log_p, -jnp.inf)
 
     def mean(self) -> Any:
         return self.probs

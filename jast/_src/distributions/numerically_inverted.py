@@ -22,7 +22,7 @@ from jast._src.distributions.family_table import register, register_both
 from jast._src.distributions.log_tail_rows import log_tails_of, of_inverse
 from jast._src.distributions.normal import Symmetric
 from jast._src.distributions.normal_tails import HALF_LOG_2PI, log_tails, normal_of_log_tails
-from jast._src.distributions.operations import from_normal, no_quantile
+from jast._src.distributions.operations import from_normal, mode, no_quantile
 from jast._src.distributions.tables import interpolated, numbers, serves, tail
 
 __all__ = ["MixtureSameFamily", "StudentT", "newton"]
@@ -269,4 +269,12 @@ def _mixture(d, z):
     return newton(_score_mixture, type(d).log_prob, d, z, guess, low, high)
 
 
-register_both(MixtureSameFamily, **of_inverse(_mixture, _tails_mixture))
+def _mode_of_mixture(d):
+    """The likeliest of the modes of its parts."""
+    parts = d.components_distribution
+    each = jnp.moveaxis(jnp.broadcast_to(mode(parts), parts.batch_shape), -1, 0)
+    best = jnp.argmax(jax.vmap(d.log_prob)(each), axis=0)
+    return jnp.take_along_axis(each, best[None], axis=0)[0]
+
+
+register_both(MixtureSameFamily, mode=_mode_of_mixture, **of_inverse(_mixture, _tails_mixture))

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 
 from jast._src.core.typing import Array, DistributionLike, Numeric, PRNGKey
 from jast._src.distributions import fine_draws
-from jast._src.distributions.base import Distribution, as_key, float_array
+from jast._src.distributions.base import Distribution, as_key, float_array, parameter_array
 from jast._src.distributions.normal_tails import float_dtype, fraction
 from jast._src.distributions.operations import log_density, mode
 
@@ -136,9 +136,10 @@ class Tent(Distribution):
         high: Numeric = 1.0,
     ) -> None:
         center = float_array(center)
-        self._center, self._width, self._low, self._high = (
-            jnp.asarray(v, center.dtype) for v in (center, width, low, high)
-        )
+        low, high = (jnp.asarray(v, center.dtype) for v in (low, high))
+        self._center = parameter_array("Tent: center", center, low, high)
+        self._width = jnp.asarray(parameter_array("Tent: width", width), center.dtype)
+        self._low, self._high = low, high
 
     @property
     def batch_shape(self) -> tuple[int, ...]:
