@@ -86,3 +86,16 @@ def test_more_than_fits_one_chunk_is_the_same_start(key):
     few, many = (monte_carlo(key, sim, n).draws for n in (5000, SAMPLES))
     mine = many.row < 5000
     np.testing.assert_array_equal(few.row[few.failure], many.row[many.failure & mine])
+
+
+def test_events_of_another_simulator_are_refused(key):
+    """Its failures do not fail in this one; and an event that cannot be asked is named."""
+    noise = D.Normal(0.0, 1.0)
+    sim, longer, harder = above(noise, 1.5), above(noise, 1.5, 3), above(noise, 4.0)
+    found = monte_carlo(key, sim, SAMPLES)
+    words = "events: sim must be the simulator .* one in which [0-9]+ of [0-9]+ do"
+    for other in (longer, harder):
+        with pytest.raises(ValueError, match=words):
+            events(other, found, {"any": lambda s: s > 0})
+    with pytest.raises(ValueError, match="named: odd: raised AttributeError"):
+        events(sim, found, {"odd": lambda s: s.speed > 0})

@@ -1,7 +1,8 @@
 """Named events on the failures of one estimate: how probable each is, alone and given a failure.
 
-The failing draws are made again from their key, and the system is run to where each ended; nothing
-is judged again, so that the weights stay what they were.
+The failing draws are made again from their key, and the system is run to where each ended. That it
+fails there is only to show that it is the simulator of the estimate: the weights stay what they
+were.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from jax import lax
 
 from jast import distributions as D
 from jast._src.core import rewards
+from jast._src.core.contract import called
 from jast._src.core.episode import play_back
 from jast._src.core.policy import Policy
 from jast._src.core.simulator import Simulator, first_state, next_state
@@ -36,6 +38,7 @@ from jast._src.estimate.weighted_draws import (
     source_key,
 )
 from jast._src.normal_space.transform import dimension, policy_of
+from jast._src.runtime.host_errors import runs_on_host
 from jast._src.util import display
 from jast._src.util.checks import check_random_key, one_of, whole_number, wrong
 from jast._src.util.intervals import clopper_pearson, log_normal
@@ -47,6 +50,9 @@ BLOCK_EPISODES = 1024
 """Draws that are made again side by side, in one program whatever their number."""
 BLOCK_STARTS = 2**16
 """First states of the model that are looked at side by side."""
+LEAST_FAILING = 0.5
+"""Share of the failing draws that fail again, below which the simulator is another one: rounding
+changes few of them."""
 EVENT_ARGUMENTS = ("state", "start", "episode")
 
 
@@ -138,9 +144,10 @@ def events(
         level: of the intervals (default: the estimate's).
 
     Raises:
-        ValueError: for an estimate without draws or without a failure, one by episodes of another
-            number of random numbers, an event that is no function or returns no bool, another
-            ``of``, and a missing proposal.
+        ValueError: for an estimate without draws or without a failure, one of another simulator
+            (with another number of random numbers in an episode, or whose failures mostly do not
+            fail in this one), an event that is no function or returns no bool, another ``of``, and
+            a missing proposal.
 
     Example:
         >>> import jax, jast
@@ -282,7 +289,7 @@ def _evaluate_events(name, sim, draws, functions, of, proposal):
     if by_policy and proposal is None:
         raise ValueError(f"{name}: proposal must be the one that the estimate was made with")
     proposal = as_proposal(name, sim, proposal) if by_policy else None
-    key, out = source_key(draws), {k: [] for k in functions}
+    key, out, failing = source_key(draws), {k: [] for k in functions}, 0
     for i in np.unique(rows // draws.lanes):
         mine = rows // draws.lanes == i
         lanes, steps = rows[mine] % draws.lanes, length[mine]
@@ -295,18 +302,24 @@ def _evaluate_events(name, sim, draws, functions, of, proposal):
         for a in range(0, len(lanes), BLOCK_EPISODES):
             part = np.arange(a, a + BLOCK_EPISODES).clip(max=len(lanes) - 1)
             some, until = made[lanes[part]], jnp.asarray(steps[part])
-            seen = _evaluate_block(sim, functions, proposal, some, until, of)
+            seen, fails = _evaluate_block(sim, functions, proposal, some, until, of)
+            failing += int(np.asarray(fails)[: len(lanes) - a].sum())
             for k, v in seen.items():
                 if v.shape != (BLOCK_EPISODES,) or v.dtype != bool:
                     received = f"{v.dtype}{list(v.shape[1:])}"
                     raise ValueError(f"{name}: {k} must return a bool scalar, received {received}")
                 out[k].append(np.asarray(v)[: len(lanes) - a])
+    if failing < LEAST_FAILING * len(rows):
+        must = "be the simulator of the estimate, whose failures fail"
+        raise wrong(name, "sim", must, f"one in which {failing} of {len(rows)} do")
     return {k: np.concatenate(v) for k, v in out.items()}
 
 
 @partial(jax.jit, static_argnums=5)
 def _evaluate_block(sim, functions, proposal, made, length, of):
-    """Name -> what it returns for each of the draws ``made``, points or keys, of known length."""
+    """Name -> what it returns for each of the draws ``made``, points or keys, of known length; and
+    whether each fails at its end, of which a black box is not asked.
+    """
 
     def one(made, length):
         x0, choose = _disturbances(sim, proposal, made)
@@ -322,9 +335,15 @@ def _evaluate_block(sim, functions, proposal, made, length, of):
             shown = play_back(sim, rewards.STANDARD, x0, xs, length)
         else:
             shown = last if of == "state" else first
-        return {k: jnp.asarray(f(shown)) for k, f in functions.items()}
+        fails = jnp.asarray(True) if runs_on_host(sim) else sim.evaluate(last)[0]
+        return _happens(functions, shown), fails
 
     return jax.vmap(one)(made, length)
+
+
+def _happens(functions, shown):
+    """Name -> what each function returns of what it is ``shown``."""
+    return {k: jnp.asarray(called(f"named: {k}", f, shown)) for k, f in functions.items()}
 
 
 def _disturbances(sim, proposal, made):
@@ -349,6 +368,6 @@ def _evaluate_starts(key, sim, functions):
 
     def one(key):
         first = first_state(sim, D.sample(sim.start(), key))
-        return {k: jnp.asarray(f(first)) for k, f in functions.items()}
+        return _happens(functions, first)
 
     return jax.vmap(one)(jax.random.split(key, BLOCK_STARTS))
