@@ -1,5 +1,5 @@
 """Episodes that a CPU second buys: ``python -m benchmarks.rates [--json] [--quick | --smoke]
-[--systems NAME ...] [--methods NAME ...] [--evaluations N]``.
+[--systems NAME ...] [--methods NAME ...] [--evaluations N] [--families | --tilts]``.
 
 `jast.estimate.monte_carlo`, `jast.estimate.failure_probability` and `jast.stress`, the last two
 with 2,097,152 evaluations (or all with ``--evaluations``), beside a minimal loop in one program:
@@ -9,6 +9,8 @@ one after the other. On an accelerator seconds are those of the clock on the wal
 
 ``--families``: what a random number of each family takes in their place, from a normal number,
 where its shape is known before the program is compiled, and where it is not; and to compile.
+
+``--tilts``: how many evaluations of a population take as long as a draw of tilts.
 """
 
 import warnings
@@ -23,6 +25,9 @@ import jast
 import jast.distributions as D
 from benchmarks.closed_loops import JUDGED, RARE, TUNED
 from benchmarks.sizes import add_choices, options, print_report, printer, size
+from jast._src.estimate.population.population import episodes_a_second
+from jast._src.estimate.proposal_search.search_state import search_context
+from jast._src.estimate.tilts.family import TiltFamily
 from jast._src.runtime.device import block_size, read_clock
 
 __all__ = ["SYSTEMS", "rates"]
@@ -100,6 +105,16 @@ def rates(
     return dict(minimal_loop=alone, **shares)
 
 
+def evaluations_a_draw(sim: jast.Simulator, budget: int) -> float:
+    """Evaluations of a population in the time of a draw of tilts, of three Gaussians a number, in
+    batches of a call with this ``budget``.
+    """
+    key = jax.random.key(0)
+    f = TiltFamily(sim, budget, search_context(key), components_each=3)
+    by_tilts = _rate(lambda seed: len(f.play(f.untilted()).log_weight))
+    return episodes_a_second(key, sim) / by_tilts
+
+
 def families(numbers: int, kinds: Sequence[D.Distribution]) -> list[dict[str, float]]:
     """Of each family microseconds a number, and seconds to compile, by table and solved for."""
     rows, z = [], jax.random.normal(jax.random.key(0), (numbers // 128, 128))
@@ -131,6 +146,7 @@ def main(argv: list[str] | None = None) -> None:
     add_choices(parser, "--methods", METHODS)
     parser.add_argument("--evaluations", type=int, help="of each method")
     parser.add_argument("--families", action="store_true", help="random numbers, alone")
+    parser.add_argument("--tilts", action="store_true", help="draws of tilts, alone")
     args = parser.parse_args(argv)
     say, by_family, kinds = printer(args), [], size(args, FAMILIES, FAMILIES, FAMILIES[-1:])
     if args.families or args.smoke:
@@ -142,6 +158,13 @@ def main(argv: list[str] | None = None) -> None:
         if args.families:
             return print_report(args, dict(families=by_family))
     names = args.systems or size(args, list(SYSTEMS), ["drone", "grid", "cart-pole"], ["grid"])
+    tilts = []
+    for name in names if args.tilts or args.smoke else ():
+        row = evaluations_a_draw(SYSTEMS[name], size(args, 500_000, 100_000, 2000))
+        tilts.append(dict(system=name, evaluations_a_draw=row))
+        say(f"{name:12s} a draw of tilts takes as long as {row:.1f} evaluations")
+    if args.tilts:
+        return print_report(args, dict(tilts=tilts))
     episodes, evaluations = size(args, (2**20, EVALUATIONS), (2**19, EVALUATIONS), (2**12, 2**12))
     if args.evaluations:
         episodes = evaluations = args.evaluations
@@ -153,7 +176,14 @@ def main(argv: list[str] | None = None) -> None:
         shares = "  ".join(f"{m} {rows[-1][m]:.3f}" for m in methods)
         say(f"{name:12s} minimal loop {rows[-1]['minimal_loop']:9.0f} a CPU second; {shares}")
     print_report(
-        args, dict(episodes=episodes, evaluations=evaluations, rows=rows, families=by_family)
+        args,
+        dict(
+            episodes=episodes,
+            evaluations=evaluations,
+            rows=rows,
+            families=by_family,
+            tilts=tilts,
+        ),
     )
 
 

@@ -138,9 +138,9 @@ def test_two_parts_that_are_missing_get_a_tilt_each(key):
     state = add_batch(f, SearchState(), f.draw(q))
     part = lambda after: max(uncovered(f, after, points).mean() for points in lost)
     assert part(state) > 0.9
-    both = audit._absorb(f, state, [Missing(1.0, points) for points in lost])
+    both = audit.absorb_missing(f, state, [Missing(1.0, points) for points in lost])
     assert part(both) < 0.05 and len(both.q.tilts) == 7
-    twice = audit._absorb(f, state, [Missing(1.0, lost[0]), Missing(float("nan"), lost[0])])
+    twice = audit.absorb_missing(f, state, [Missing(1.0, lost[0]), Missing(float("nan"), lost[0])])
     assert len(twice.q.tilts) <= 7 and not uncovered(f, twice, lost[0]).any()
 
 

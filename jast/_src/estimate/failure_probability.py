@@ -66,8 +66,9 @@ def failure_probability(
     """The probability that a system fails, by the way that suits what an episode costs.
 
     By default the rate of the system is measured. One that simulates 300,000 episodes in 24 CPU
-    seconds is answered by populations that stay on the device (`population`), and so is every
-    system in JAX with a budget from 300,000 on. ``settings`` names the budget that was used: the
+    seconds is answered by populations that stay on the device (`population`), and by draws of
+    Gaussians or tilts that are fitted to their failures; and so is every system in JAX with a
+    budget from 300,000 on. ``settings`` names the budget that was used: the
     same key with that budget gives the same bits. The others, and calls with ``failures`` or
     ``near``, are answered by a proposal that this function finds itself.
 

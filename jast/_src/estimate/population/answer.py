@@ -46,18 +46,16 @@ def estimate_from_populations(
     """The `Estimate` of all populations of ``kinds``; or that of importance sampling,
     ``by_weights``, which these check.
     """
-    answer, reasons = _agreed_answer(search, kinds)
     plain = tuple(map(int, search.plain))
     sample = sample_from(search.runs[kinds[0]])
     method = f"{name}: populations " + " and ".join(dict.fromkeys(map(str, kinds)))
     if by_weights is None:
+        answer, reasons = _agreed_answer(search, kinds)
         found = _estimate_from_answer(search, kinds, level, answer, sample)
     else:
         found, method = by_weights, f"{method}, then importance sampling"
-        populations, answer = answer, Answer(found.log_mean, found.relative_error)
-        if answer.apart(populations) > MAX_DISAGREEMENT:
-            said = f"importance sampling, {answer}, against populations, {populations}"
-            reasons = [said, *reasons]
+        answer = Answer(found.log_mean, found.relative_error)
+        reasons = _check_by_populations(search, kinds, answer)
     interrupted = [search.interrupted] if search.interrupted else []
     reasons = [*search.reasons, *interrupted, *reasons, *contradictions(answer, plain)]
     found = found._replace(
@@ -125,6 +123,24 @@ def _agreed_answer(search, kinds):
     if apart > MAX_DISAGREEMENT:
         return answers[0], [f"{UNCONFIRMED} the ways do not agree, {said}"]
     return pool_answers(answers), []
+
+
+def _check_by_populations(search, kinds, exact):
+    """Why the `Answer` of importance sampling must not be believed. Its proposal covers failures of
+    both ways, so that one that says much less has seldom met what the other did; one that says
+    more, or both together where they agree, has met what it does not draw.
+    """
+    answers = [search.answer(k) for k in kinds]
+    said = " and ".join(f"{a} {k}" for k, a in zip(kinds, answers, strict=True))
+    apart = " and ".join(f"{a.apart(exact):.1f}" for a in answers)
+    search.history.append(f"populations, {said}: {apart} standard errors apart from it")
+    near = [a.apart(exact) <= MAX_DISAGREEMENT for a in answers]
+    if search.agree(kinds):
+        answers.append(pool_answers(answers))
+    more = [a for a in answers if a.log_mean > exact.log_mean]
+    if any(near) and all(a.apart(exact) <= MAX_DISAGREEMENT for a in more):
+        return []
+    return [f"importance sampling, {exact}, against populations, {said}"]
 
 
 def _estimate_from_answer(search, kinds, level, answer, sample):

@@ -1,5 +1,5 @@
-"""Importance sampling after populations: Gaussians that are fitted to thousands of their failures
-draw the last part, where they promise more than further populations.
+"""Importance sampling after populations: Gaussians or tilts that are fitted to their failures draw
+the last part, where they promise more than further populations.
 
 Where failures lie in a curved set of many numbers no Gaussians serve, and their weights would not
 say so; the failures of populations do (`benchmarks.closed_loops`: crossing, cart-pole).
@@ -22,8 +22,10 @@ from jast._src.estimate.gaussians.mixture_fit import as_latent, fit_mixture
 from jast._src.estimate.importance_sampling import chunk_size
 from jast._src.estimate.population.failure_sample import sample_from
 from jast._src.estimate.population.search import Answer, Kind, PopulationSearch, pool_answers
+from jast._src.estimate.population.tilted import fit_tilts
 from jast._src.estimate.proposal_search.final_draws import draw_estimate
 from jast._src.estimate.proposal_search.mixture_draws import log_ratio
+from jast._src.estimate.tilts.tilts import Tilts
 from jast._src.normal_space.transform import Latent, dimension, normal_numbers, smooth_numbers
 from jast._src.runtime.device import BLOCK
 from jast._src.runtime.progress_bar import Watch
@@ -32,6 +34,13 @@ __all__ = ["gaussians_promise_more", "importance_estimate"]
 
 TARGET_ERROR = 0.005
 """Relative standard error at which it ends: no population checks a smaller one."""
+TILTS_TARGET_ERROR = 0.01
+"""The same of tilts, which are not tried where Gaussians promise it: their draws are dear."""
+EVALUATIONS_A_DRAW = 14
+"""Evaluations of populations that take as long as a draw of tilts, in the mean: 7 to 24 on sixteen
+loops, by ``python -m benchmarks.rates --tilts``."""
+MIN_TILTED_DRAWS = 4000
+"""Draws that tilts have at least: with fewer a batch is of less than two hundred."""
 MAX_CHECK_ERROR = 0.15
 """Relative standard error of the populations above which they check no importance sampling where
 some of the disturbances are choices or counts: to what of these was not met no Gaussian is near. Of
@@ -57,28 +66,71 @@ follower in `benchmarks.time_to_answer`, which they do not, .6 to .75, two to fi
 class FittedProposal(NamedTuple):
     """A proposal, and what is expected of it."""
 
-    q: Latent
+    q: Latent | Tilts
     draws: int
     """As many as serve"""
     relative: float
     """Relative standard error of these"""
+    most: int | None = None
+    """As many as memory holds at a time; None: any number"""
 
 
 def importance_estimate(
     search: PopulationSearch, name: str, kinds: Sequence[Kind], level: float
 ) -> Estimate | None:
-    """The `Estimate` by Gaussians fitted to the failures of ``kinds``; None where populations
-    promise as much with what is left of the budget, and where its own weights speak against it.
+    """The `Estimate` by Gaussians or tilts fitted to the failures of ``kinds``; None where
+    populations promise as much with what is left of the budget, and where the weights speak against
+    them.
     """
-    left = (search.budget - search.spent) * PILOT_DIVISOR // (PILOT_DIVISOR + 1)
+    left = _affordable(search)
     if left < BLOCK or not _is_checked(search, kinds):
         return None
-    best = _best_proposal(search, kinds, left)
-    by_populations = search.answer(kinds[0]).relative  # and what they promise with the rest
-    if best.relative > by_populations / math.sqrt(1 + left / search.evaluations(kinds[0])):
-        return None
+    proposals = [_best_proposal(search, kinds, left)]
+    if proposals[0].relative > TILTS_TARGET_ERROR:
+        try:
+            proposals += _tilts(search, kinds, left // EVALUATIONS_A_DRAW)
+        except KeyboardInterrupt:
+            search.note_interruption()
+            return None
+    by_populations = search.answer(kinds[0]).relative
+    for proposal in sorted(proposals, key=lambda proposal: proposal.relative):
+        left = _affordable(search)
+        promised = by_populations / math.sqrt(1 + left / search.evaluations(kinds[0]))
+        draws = min(proposal.draws, left)  # what was fitted or drawn after it was planned is spent
+        if search.interrupted or draws < BLOCK:
+            break
+        relative = proposal.relative * math.sqrt(proposal.draws / draws)
+        if relative > promised:
+            continue
+        planned = proposal._replace(draws=draws, relative=relative)
+        if (found := _draw_checked(search, name, planned, level)) is not None:
+            return found
+    return None
+
+
+def _affordable(search):
+    """Draws that the rest of the budget affords, after a pilot of a part of them."""
+    return (search.budget - search.spent) * PILOT_DIVISOR // (PILOT_DIVISOR + 1)
+
+
+def _tilts(search, kinds, draws):
+    """[`FittedProposal`] of tilts, of so many ``draws`` in all; [] where these do not serve."""
+    spent = search.spent
+    fitted = fit_tilts(search, kinds, draws) if draws >= MIN_TILTED_DRAWS else None
+    if fitted is None:
+        return []
+    wanted = 1 / (fitted.efficiency * TILTS_TARGET_ERROR**2)
+    draws = max(int(min(wanted, draws - (search.spent - spent))), BLOCK)
+    relative = 1 / math.sqrt(fitted.efficiency * draws)
+    return [FittedProposal(fitted.q, draws, relative, fitted.most)]
+
+
+def _draw_checked(search, name, proposal, level):
+    """The `Estimate` of the draws of a `FittedProposal`, a pilot before them; None where their
+    weights speak against it, or it was interrupted before them.
+    """
     for_pilot, for_draws = jax.random.split(search.key)
-    pilot = best._replace(draws=max(best.draws // PILOT_DIVISOR, BLOCK))
+    pilot = proposal._replace(draws=max(proposal.draws // PILOT_DIVISOR, BLOCK))
     found = _draw_estimate(search, name, "a pilot of importance sampling", for_pilot, pilot, level)
     if found is None or search.interrupted:
         return None
@@ -87,7 +139,7 @@ def importance_estimate(
     if found.k_hat > MAX_SHAPE + SHAPE_ERRORS * error:
         reason = f"Pareto k-hat above {MAX_SHAPE}: the weights have no variance"
     else:
-        found = _draw_estimate(search, name, "importance sampling", for_draws, best, level)
+        found = _draw_estimate(search, name, "importance sampling", for_draws, proposal, level)
         if found is None or found.reliable:
             return found
         reason = "; ".join(found.warnings)
@@ -145,7 +197,9 @@ def _draw_estimate(search, name, said, key, proposal, level):
     """The `Estimate` of the draws of a `FittedProposal`, which are ``said`` to be so; None where an
     interruption left none.
     """
+    said += " by tilts" if isinstance(proposal.q, Tilts) else " by Gaussians"
     watch = Watch(name, proposal.draws, "episode", False, None)
+    lanes = chunk_size(proposal.draws)
     # each has a checkpoint of its own
     placement = search.placement._replace(name=said.replace(" ", "-"))
     try:
@@ -153,7 +207,7 @@ def _draw_estimate(search, name, said, key, proposal, level):
             key,
             search.sim,
             proposal.q,
-            chunk_size(proposal.draws),
+            min(lanes, proposal.most or lanes),
             watch,
             placement,
             spent=search.spent,

@@ -3,6 +3,7 @@ not fitted to. It absorbs what they find, or that becomes a reason against the e
 """
 
 import math
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -26,7 +27,7 @@ from jast._src.estimate.proposal_search.search_state import (
 from jast._src.normal_space.transform import dimension
 from jast._src.util.pytrees import index_tree
 
-__all__ = ["audit_proposal", "uncovered"]
+__all__ = ["Missing", "absorb_missing", "audit_proposal", "missing_among", "uncovered"]
 
 FORGOTTEN = "the proposal hardly draws some failures that wide noise led to"
 UNFINISHED = "the budget ran out before the search for lost failure modes was over"
@@ -69,12 +70,12 @@ def audit_proposal(family: Family, state: SearchState) -> SearchState:
             break
         if last:
             return _check_given(family, _report(state, missing))
-        state = _absorb(family, state, missing)
+        state = absorb_missing(family, state, missing)
         state = adapt_proposal(family, state, settings.audit_refits, end)
     return _check_given(family, _check_uncovered_share(family, state))
 
 
-def _absorb(family, state, missing):
+def absorb_missing(family: Family, state: SearchState, missing: Sequence[Missing]) -> SearchState:
     """The state whose proposal takes in all of ``missing``: of each the part that those before it
     do not cover, as one lost mode may have been found twice.
     """
@@ -176,11 +177,8 @@ def _missing(family, state, cooled, explored):
     missing = []
     for share, p in [*found, *((1.0, p) for p in state.populations)]:
         state, points = family.as_points(state, p.points, p.used)
-        rows = uncovered(family, state, points)
-        part = rows.sum() / max(len(rows), 1)
-        missing.append(Missing(share * part, index_tree(points, rows)))
-        state = state.note(f"audit: {share:.2%} of the probability, {part:.0%} not covered")
-    missing = [m for m in missing if _unseen_mass(family, state, m) > settings.tolerated_mass]
+        state, lost = missing_among(family, state, points, share)
+        missing += lost
     if cooled is not None:
         rows = _unseen(family, state, cooled)
         state = state.note(f"audit: {rows.sum()} of {len(rows)} failures moved not covered")
@@ -188,6 +186,20 @@ def _missing(family, state, cooled, explored):
         if not by_chance or (rows.any() and _has_few_numbers(family)):
             missing.append(Missing(math.nan, index_tree(cooled, rows), by_chance))
     return state, missing
+
+
+def missing_among(
+    family: Family, state: SearchState, points: Any, share: float
+) -> tuple[SearchState, list[Missing]]:
+    """What is `Missing` of ``points`` [m], whose probability is a ``share``, as great, times what
+    the proposal found; nothing where that is little, or batches have drawn it.
+    """
+    rows = uncovered(family, state, points)
+    part = rows.sum() / max(len(rows), 1)
+    state = state.note(f"audit: {share:.2%} of the probability, {part:.0%} not covered")
+    missing = Missing(share * part, index_tree(points, rows))
+    unseen = _unseen_mass(family, state, missing)
+    return state, [missing] if unseen > family.settings.tolerated_mass else []
 
 
 def _explore_uncovered(family, state):

@@ -31,7 +31,7 @@ from jast._src.normal_space.transform import normal_numbers, side_by_side
 from jast._src.runtime._jax import quick
 from jast._src.util.pytrees import index_tree
 
-__all__ = ["absorb_given", "cool_failures", "descend_levels", "replay_given"]
+__all__ = ["FAR", "absorb_given", "cool_failures", "descend_levels", "replay_given"]
 
 FAR = 37.0  # the normal number of a value at the end of a support, whose own is infinite
 

@@ -102,11 +102,15 @@ class TiltFamily(NamedTuple):
     @property
     def batch(self) -> int:
         """Episodes of a batch: fewer where they are so long that memory would not hold them."""
+        small = min(self.budget // BATCHES_OF_SMALL, SMALL_BATCH)
+        return min(max(self.budget // BATCHES, small), self.most)
+
+    @property
+    def most(self) -> int:
+        """Episodes that memory holds."""
         normals, choices, categories, _ = self.about.steps
         a_step = self.about.seen + normals + choices * (1 + categories)
-        most = HELD / (a_step * self.sim.horizon) + LEAST_BATCH
-        small = min(self.budget // BATCHES_OF_SMALL, SMALL_BATCH)
-        return int(min(max(self.budget // BATCHES, small), most))
+        return int(HELD / (a_step * self.sim.horizon) + LEAST_BATCH)
 
     @property
     def kept(self) -> float:

@@ -49,6 +49,7 @@ __all__ = [
     "simulate_tilts",
     "stack_choices",
     "step_numbers",
+    "tilt_inputs",
 ]
 
 LANES = 512  # episodes that run side by side
