@@ -189,11 +189,8 @@ def parameter_array(name: str, x: Any, low: Any = 0, high: float = np.inf) -> An
         coarse = min(dtypes, key=lambda dtype: dtype.itemsize)  # in which equal numbers are equal
         known = np.asarray(array, coarse)
         if not ((known >= np.asarray(low, coarse)) & (known <= high)).all():  # of NaN neither is
-            words = (
-                f"lie between {low} and {high}"
-                if np.all(np.isfinite(high))
-                else f"be at least {low}"
-            )
+            bounded = np.isfinite(high).all()
+            words = f"lie between {low} and {high}" if bounded else f"be at least {low}"
             raise ValueError(f"{name} must {words}, received {x}")
     return array
 
