@@ -603,6 +603,30 @@ def test_stress_of_a_rare_failure(key, small):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("coarse", [False, True])
+def test_what_the_estimate_left_cools_where_no_slope_leads_to_the_likeliest(
+    coarse, key, small, monkeypatch
+):
+    """The half-space at 4, whose distance is told in whole numbers or not: its likeliest failure
+    has e^-8 either way.
+    """
+    by_populations = stress_test.by_populations
+    few = lambda name, key, sim, budget, **how: by_populations(name, key, sim, 60_000, **how)
+    monkeypatch.setattr(stress_test, "by_populations", few)
+
+    def distance(u):
+        d = 4.0 - jnp.sum(u) / 3**0.5
+        return jnp.ceil(d) if coarse else d
+
+    report = jast.stress(key, limit_state(distance, 3), 300_000)
+    spent = {t.name: t.evaluations for t in report.tried}
+    assert ("cooled slowly" in spent) == coarse
+    assert spent.get("cooled slowly", 0) > stress_test.COOLING_SHARE * 300_000 or not coarse
+    assert report.episodes <= 300_000
+    assert float(report.failures.best.reward) == pytest.approx(-8, abs=0.05)
+
+
+@pytest.mark.slow
 def test_a_default_stress_is_made_again_where_a_known_budget_would_do(key, small, monkeypatch):
     monkeypatch.setattr(budgets, "measure_budget", lambda *args: 50_000)
     more = lambda found, budget: 60_000 if budget == 50_000 else None

@@ -48,7 +48,8 @@ def stress(
     populations that stay on the device (`jast.estimate.population`): they tell the probability,
     their failures are cooled to the likeliest near to each, pulled to where log p is greatest
     (`jast.search.refine`), and sorted into failure modes, each with its share of the probability.
-    The same holds of every system in JAX with a budget from 300,000 on.
+    What the estimate left of the budget cools them once more, slowly, unless slopes say that the
+    likeliest is found. The same holds of every system in JAX with a budget from 300,000 on.
 
     For the others a portfolio of explorers looks for failures (those whose failures get likelier
     are given more of the budget), and the probability is that of

@@ -105,6 +105,7 @@ class StressTest:
         self.nominal = self.probability = None
         self.pool = self.failures = self.refined = empty(sim)
         self.modes, self.tried = Modes(), []
+        self.cooled = None  # points [m, D] of populations that were cooled
         self.spent = self.invalid = 0
         self.residual = self.late = np.nan
         self.has_points = has_quantiles(sim)
@@ -199,15 +200,19 @@ class StressTest:
             ("cooled", False, INDEPENDENT_SHARE),
             ("cooled together", True, 1 - INDEPENDENT_SHARE),
         ):
-            self.watch.doing("cooling failures")
-            key, budget = self.next_key(), int(share * cooling)
-            with where_few_points_run():
-                points, spent = cool_failures(key, self.sim, sample.points[rows], budget, replace)
-            self.add_failures(name, failures_at(self.sim, points)._replace(evaluations=spent))
-        self.parts = BudgetShares(nominal=0, search=0, slow_search=0, refine=refining)
-        self.modes_budget = refining // 4
+            self.cool(name, sample.points[rows], int(share * cooling), replace)
+        self.parts = BudgetShares(nominal=0, search=0, slow_search=cooling, refine=refining)
+        self.modes_budget, self.cooled = refining // 4, sample.points[rows]
         self.refine()
         self.tell_shares(sample)
+
+    def cool(self, name, points, budget, replace):
+        """The failures that ``points`` [m, D] are once they are cooled, which join the pool."""
+        self.watch.doing("cooling failures")
+        with where_few_points_run():
+            points, spent = cool_failures(self.next_key(), self.sim, points, budget, replace)
+        found = failures_at(self.sim, points)._replace(evaluations=spent)
+        return self.add_failures(name, found)
 
     def search(self):
         """Every explorer once; then those again whose failures get likelier for what they cost."""
@@ -307,7 +312,15 @@ class StressTest:
         return self.residual < OPTIMAL_RESIDUAL and len(self.modes) <= FEW_MODES
 
     def search_slowly(self, start: Failures) -> Failures:
-        """Likelier failures by many small steps, one half of them from the likeliest known."""
+        """Likelier failures by many small steps, one half of them from the likeliest known; by what
+        the estimate left of the budget where populations made it, as they cool failures better.
+        """
+        if self.cooled is not None:
+            left = self.budget - self.spent - self.parts.refine - self.modes_budget
+            if left < self.parts.slow_search or not on_cpu():
+                return start
+            found = self.cool("cooled slowly", self.cooled, left, True)
+            return merge(start, found, top=REFINED_FACTOR * self.top)
         budget = self.affordable(self.parts.slow_search) // 2
         if budget < MIN_DIVIDED_BUDGET:
             return start
