@@ -399,6 +399,16 @@ def test_cdf_of_the_users_own(key):
             D.cdf(d, jnp.asarray(0.25))
 
 
+@pytest.mark.parametrize("d", [D.Normal(0.0, 1.0), D.Poisson(3.0), D.Gamma(2.0, 1.0)])
+def test_quantile_takes_a_plain_number(d):
+    assert D.quantile(d, 0.5) == D.quantile(d, jnp.asarray(0.5))
+
+
+def test_quantile_of_a_joint_takes_plain_numbers():
+    both = D.Joint({"a": D.Normal(0.0, 1.0), "b": D.Uniform(0.0, 1.0)})
+    assert D.quantile(both, {"a": 0.5, "b": 0.25}) == {"a": 0, "b": 0.25}
+
+
 def test_cdf_names_the_distribution_that_has_no_quantile():
     one = jnp.asarray(1.0)
     for d in (D.Dirichlet(jnp.stack([one, one])), D.seeds()):

@@ -138,7 +138,7 @@ def quantile(d: DistributionLike, u: ArrayTree) -> ArrayTree:
     known = row(d, "quantile").quantile
     if known is None:
         raise no_quantile(d)
-    return known(d, u)
+    return known(d, jax.tree.map(jnp.asarray, u))  # plain numbers, too
 
 
 def cdf(d: DistributionLike, x: ArrayTree) -> ArrayTree:
