@@ -320,7 +320,8 @@ class StressTest:
             if left < self.parts.slow_search or not on_cpu():
                 return start
             found = self.cool("cooled slowly", self.cooled, left, True)
-            return merge(start, found, top=REFINED_FACTOR * self.top)
+            # all of them would take what is left to refine the likeliest
+            return merge(start, found[:1], top=REFINED_FACTOR * self.top)
         budget = self.affordable(self.parts.slow_search) // 2
         if budget < MIN_DIVIDED_BUDGET:
             return start
