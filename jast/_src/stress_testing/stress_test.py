@@ -312,12 +312,13 @@ class StressTest:
         return self.residual < OPTIMAL_RESIDUAL and len(self.modes) <= FEW_MODES
 
     def search_slowly(self, start: Failures) -> Failures:
-        """Likelier failures by many small steps, one half of them from the likeliest known; by what
-        the estimate left of the budget where populations made it, as they cool failures better.
+        """Likelier failures by many small steps. After populations their failures are cooled again,
+        by what the estimate left of the budget; else half of the steps of cross-entropy begin at
+        the likeliest known.
         """
         if self.cooled is not None:
             left = self.budget - self.spent - self.parts.refine - self.modes_budget
-            if left < self.parts.slow_search or not on_cpu():
+            if left < self.parts.slow_search or not on_cpu():  # no more than the first coolings had
                 return start
             found = self.cool("cooled slowly", self.cooled, left, True)
             # all of them would take what is left to refine the likeliest
