@@ -11,6 +11,7 @@ whose evaluations the others then have. The cases named "... loop" are those of
 
 import time
 import warnings
+from dataclasses import replace
 from functools import partial
 from unittest import mock
 
@@ -23,6 +24,7 @@ from benchmarks import cma_es as driver
 from benchmarks.sizes import add_choices, installed, options, print_report, size
 from benchmarks.stress_systems import CASES, JUDGED, LOOPS
 from jast._src.core.failures import empty
+from jast._src.estimate.population import descents
 from jast._src.estimate.population.descents import SETTINGS, cool_failures
 from jast._src.estimate.proposal_search.mixture_draws import resample
 from jast._src.normal_space.mode_coordinates import centred
@@ -106,6 +108,13 @@ def cma_es(key, sim, budget):
     return _best(more.failures), spent + more.episodes, None
 
 
+def windows(key, sim, budget):
+    """`stress` where failures that are cooled together move as those do that go on alone."""
+    as_alone = replace(SETTINGS, kinds_cooling_together=SETTINGS.kinds_by_width)
+    with mock.patch.object(descents, "SETTINGS", as_alone):
+        return stress(key, sim, budget)
+
+
 def slow_cooling(key, sim, budget):
     """The failures of populations cooled ten times as slowly as in `stress`, then refined."""
     for_failures, for_cooling, for_refinement = jax.random.split(key, 3)
@@ -133,7 +142,7 @@ def _scored(sim, z):
 
 
 USUAL = stress, monte_carlo, cem, forest, mcts, cma_es
-SINGLE = gradient, go_explore, chain, slow_cooling
+SINGLE = gradient, go_explore, chain, windows, slow_cooling
 """Searches for some kinds of system or budget alone: measured where they are asked for."""
 METHODS = {f.__name__: f for f in USUAL + SINGLE}
 

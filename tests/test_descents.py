@@ -21,6 +21,7 @@ from jast._src.estimate.population import descents, search
 from jast._src.estimate.population.descents import DESCENTS, by_distance, by_width
 from jast._src.estimate.population.particle_moves import (
     AFTER,
+    DIFFERENCE,
     SMALL,
     WINDOW,
     Particles,
@@ -110,6 +111,38 @@ def test_a_window_draws_neighbours_anew(key):
     assert stats.chisquare(begin.sum(axis=0)).pvalue > CHANCE
     assert stats.kstest(np.asarray(after.z)[changed], norm.cdf).pvalue > CHANCE
     assert (steering.accepted == 1).all()
+
+
+@pytest.mark.parametrize("live", [1, 2, 3, 200])
+def test_a_difference_is_one_of_points_that_live_and_leaves_the_norm(live, key):
+    """One move of the first of 256 points, more than a block of 128 side by side or less: each ends
+    in the span of itself and a difference of two others of its block. Where no two others are to be
+    had, every bit stays.
+    """
+    sim = limit_state(lambda u: 99.0 - u[0], 6)
+    z = np.random.default_rng(0).standard_normal((256, 6)).astype(np.float32)
+    after, steering, _ = move_particles(
+        sim,
+        as_particles(sim, z),
+        counter_key(key, 1),
+        np.arange(live),
+        Steering(np.array([0.4, 0.4], np.float32), np.zeros(2, np.float32)),
+        moves=1,
+        level=np.inf,
+        kinds=(DIFFERENCE, DIFFERENCE),
+    )
+    new, z = np.asarray(after.z)[:live], z[:live]
+    assert steering.accepted[0] == 1
+    np.testing.assert_allclose(np.linalg.norm(new, axis=1), np.linalg.norm(z, axis=1), rtol=1e-5)
+    if live < 3:
+        return np.testing.assert_array_equal(new, z)
+    for block in np.split(np.arange(live), [128]):
+        for i in block:
+            # new = a (z_i + .4 (z_j - z_k)), by all pairs
+            pairs = z[block][:, None] - z[block][None]
+            along = z[i] + 0.4 * pairs.reshape(-1, 6)
+            along *= np.linalg.norm(z[i]) / np.linalg.norm(along, axis=1, keepdims=True)
+            assert np.abs(along - new[i]).max(axis=1).min() < 1e-5
 
 
 def test_what_comes_after_a_level_is_drawn_anew(key):

@@ -3,6 +3,7 @@ they cannot be sure they say so.
 """
 
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from functools import partial
 
 import jax
@@ -237,6 +238,26 @@ def test_cooling_comes_to_the_likeliest(key, together):
     points, spent = ways.cool_failures(key, HALF, run.points[:128], 60_000, together)
     best = 0.5 * (points**2).sum(axis=1).min()
     assert 4.5 <= best * (1 + 1e-5) < 4.55 and spent <= 60_000
+
+
+def test_differences_cool_a_thin_layer_further_than_windows_do(key, monkeypatch):
+    """Failures of the half-space at 5 of a sum of 100 numbers, from beyond it: with the same
+    evaluations the likeliest are less than half as far above the design point, 12.5.
+    """
+    e = np.full(100, 0.1)
+    sim = limit_state(lambda u: 5.0 - u.sum() / 10, 100)
+    start = np.random.default_rng(0).standard_normal((128, 100))
+    start += np.outer(5.1 + np.abs(start @ e) - start @ e, e)
+    start = start.astype(np.dtype(normal_numbers(sim)))
+
+    def excess():
+        points, _ = ways.cool_failures(key, sim, start, 60_000, True)
+        return 0.5 * (points**2).sum(axis=1).min() - 12.5
+
+    by_differences = excess()
+    windows = replace(ways.SETTINGS, kinds_cooling_together=ways.SETTINGS.kinds_by_width)
+    monkeypatch.setattr(ways, "SETTINGS", windows)
+    assert 0 < 2 * by_differences < excess()
 
 
 def test_cooling_alone_loses_no_mode_and_together_goes_to_the_likelier(key):

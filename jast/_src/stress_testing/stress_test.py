@@ -23,7 +23,7 @@ from jast._src.estimate.population.population import by_populations
 from jast._src.estimate.proposal_search.mixture_draws import resample
 from jast._src.estimate.redraw import redraw
 from jast._src.normal_space import transform
-from jast._src.runtime.device import on_cpu, where_few_points_run
+from jast._src.runtime.device import where_few_points_run
 from jast._src.runtime.host_errors import failing_runs, runs_made, runs_on_host
 from jast._src.search.refine.modes import Mode, Modes, modes, owners, spread
 from jast._src.search.refine.refine import refine
@@ -61,17 +61,16 @@ FEW_MODES = 4
 nothing else: its evaluations are the estimate's."""
 NOMINAL = 4096  # plain draws where populations follow, which begin with some themselves
 COOLING_SHARE = 0.2  # of the evaluations, to cool failures of the populations to the likeliest
-COOLING_BESIDE_ACCELERATOR = 2**20
-"""Of them at most where an accelerator simulates: the CPU cools, and takes some five seconds. A
-fifth of what an H100 simulates by default, 33 million, took it thirty."""
+MAX_COOLING = 2**19
+"""Of them at most, as of those that cool slowly: one to two CPU seconds."""
 INDEPENDENT_SHARE = 0.25
 """Share of these by which no point replaces another, so that no mode is lost. With all of them the
 likeliest failure of the crossing is .35 nats less likely, of the cart-pole 6, of the ship 4; with
 none they are as likely as with a quarter, or up to 2 nats likelier."""
-REFINE_EVALUATIONS = 50_000
-"""Evaluations for pulling what was cooled to where log p is greatest, at most an eighth of all: on
-the crossing, the cart-pole and the ship failures are as likely with half as many and twice as many
-coolings, which cost a tenth of the CPU time."""
+REFINE_EVALUATIONS = 100_000
+"""Evaluations for pulling what was cooled to where log p is greatest, at most an eighth of all.
+With half as many the likeliest failure of the ship is .14 nats less likely and of the packets .24,
+with twice as many .1 and .04 likelier. Where nothing is gained any longer it ends by itself."""
 POOL_FACTOR = 32  # failures in the pool for each that is returned: modes are told apart among these
 HOSTED_EXTRA = 14
 """Runs of a black box that no other piece of the work counts: of `check` 10, and those for objects,
@@ -172,7 +171,7 @@ class StressTest:
     def run_populations(self):
         """The probability by populations."""
         cooling, refining = self.cooling_and_refining()
-        rest = self.budget - self.spent - cooling - 2 * refining
+        rest = self.budget - self.spent - cooling - refining - 2 * (refining // 8)
         rest = max(rest, MIN_POPULATION_BUDGET // 2)
         self.watch.doing("estimating")
         p = by_populations("stress", self.next_key(), self.sim, rest, placement=self.placement)
@@ -180,9 +179,7 @@ class StressTest:
 
     def cooling_and_refining(self):
         """Evaluations to cool failures of populations, and to refine what was cooled."""
-        cooling = int(COOLING_SHARE * self.budget)
-        if not on_cpu():
-            cooling = min(cooling, COOLING_BESIDE_ACCELERATOR)
+        cooling = min(int(COOLING_SHARE * self.budget), MAX_COOLING)
         return cooling, min(REFINE_EVALUATIONS, self.budget // 8)
 
     def find_likeliest(self):
@@ -202,7 +199,7 @@ class StressTest:
         ):
             self.cool(name, sample.points[rows], int(share * cooling), replace)
         self.parts = BudgetShares(nominal=0, search=0, slow_search=cooling, refine=refining)
-        self.modes_budget, self.cooled = refining // 4, sample.points[rows]
+        self.modes_budget, self.cooled = refining // 8, sample.points[rows]
         self.refine()
         self.tell_shares(sample)
 
@@ -318,9 +315,9 @@ class StressTest:
         """
         if self.cooled is not None:
             left = self.budget - self.spent - self.parts.refine - self.modes_budget
-            if left < self.parts.slow_search or not on_cpu():  # no more than the first coolings had
+            if left < self.parts.slow_search:  # no more than the first coolings had
                 return start
-            found = self.cool("cooled slowly", self.cooled, left, True)
+            found = self.cool("cooled slowly", self.cooled, min(left, MAX_COOLING), True)
             # all of them would take what is left to refine the likeliest
             return merge(start, found[:1], top=REFINED_FACTOR * self.top)
         budget = self.affordable(self.parts.slow_search) // 2

@@ -2,12 +2,15 @@
 moves it, and simulates it, whatever its level and its width.
 
 A move proposes a point that N(0, width^2 I) has as often as the old one, and is taken where the
-episode of the new point is at most at the level. Two kinds of moves alternate. The first changes
+episode of the new point is at most at the level. Two kinds of moves alternate. One of them changes
 all numbers a little (preconditioned Crank-Nicolson: Cotter, Roberts, Stuart and White 2013). On the
-way down the levels of the miss distance, the second keeps what led to the level and draws anew all
+way down the levels of the miss distance, the other keeps what led to the level and draws anew all
 that came after: every draw stays below it, as in splitting (Cerou and Guyader 2007). Among failures
-nothing comes after, and the second draws a few neighbouring numbers anew, which is a Gibbs move of
-a random window; in long episodes it mixes where small changes of everything do not.
+nothing comes after, and the other draws a few neighbouring numbers anew, which is a Gibbs move of
+a random window; in long episodes it mixes where small changes of everything do not. At small widths
+failures are a thin layer at right angles to their own direction, and a small change is as small as
+the layer is thin: there the other move goes along the difference of two other points (differential
+evolution: ter Braak 2006), and stays as far from the origin.
 `python -m benchmarks.populations` measures them all.
 """
 
@@ -27,6 +30,7 @@ from jast._src.util.pytrees import index_tree, select_rows
 
 __all__ = [
     "AFTER",
+    "DIFFERENCE",
     "SMALL",
     "WINDOW",
     "Particles",
@@ -40,12 +44,13 @@ __all__ = [
 
 TARGET_ACCEPTANCE = 0.35
 """Share of the moves that are taken, to which their sizes are steered; .2 to .5 serve alike."""
-SMALL, WINDOW, AFTER, STAY = range(4)
-"""Kinds of moves: of all numbers, of some neighbours, of those after the level was reached; and the
-point as it is.
+SMALL, WINDOW, AFTER, DIFFERENCE, STAY = range(5)
+"""Kinds of moves: of all numbers, of some neighbours, of those after the level was reached, along
+the difference of two other points; and the point as it is.
 """
-SIZE_BOUNDS = 0.02, 1.0
-"""Least and greatest size of a move: 1 is an independent draw, or a window of all numbers."""
+SIZE_BOUNDS = 0.002, 1.0
+"""Least and greatest size of a move: 1 is an independent draw, a window of all numbers, or a whole
+difference. Failures of the grid that are cooled to a width of .1 move by less than .02."""
 FIRST_SIZES = 0.5, 0.3
 """Of the two moves, before they are steered."""
 
@@ -71,8 +76,8 @@ class Steering(NamedTuple):
     """Sizes of the two moves, and what became of them. On the host, [2] each."""
 
     size: np.ndarray
-    """Of the small change, from 0 to 1; of the window, as a share of all numbers. What draws anew
-    all after a level has none."""
+    """Of the small change, from 0 to 1; of the window, as a share of all numbers; of a difference,
+    as a share of it. What draws anew all after a level has none."""
     accepted: np.ndarray
     """Share of the last moves that were taken"""
 
@@ -150,7 +155,8 @@ def move_particles(
     ``before``: the width that the points were drawn with, where it was another one. Numbers that an
     episode did not use are scaled to the new one, as nothing ties them. ``wide`` [D], bool: the
     numbers that have this width; the others have that of the model. Default: all. ``kinds``: of
-    the moves, which alternate.
+    the moves, which alternate; differences keep N(0, width^2 I) but nearly, as they tie points that
+    move side by side to one another.
     """
     dtype, live = np.dtype(particles.z.dtype), len(rows)
     places = np.arange(len(particles.z), dtype=np.int32)
@@ -175,28 +181,40 @@ def _move_on_device(sim, particles, key, rows, size, wide, live, moves, kinds, l
     number = jnp.arange(d, dtype=jnp.int32)[None]
     lane = jnp.arange(lanes, dtype=jnp.int32)
 
-    def change_all(z, noise, key, size, reached):
+    def change_all(z, noise, key, size, reached, beside):
         return jnp.sqrt(1 - size**2) * z + size * noise
 
-    def change_window(z, noise, key, size, reached):
+    def change_window(z, noise, key, size, reached, beside):
         begin = jnp.floor(jax.random.uniform(key, (lanes, 1), z.dtype) * d).astype(jnp.int32)
         length = jnp.maximum(jnp.floor(size * d), 1).astype(jnp.int32)
         return jnp.where(jnp.mod(number - begin, d) < length, noise, z)
 
-    def change_after(z, noise, key, size, reached):
+    def change_after(z, noise, key, size, reached, beside):
         return jnp.where(number < reached[:, None], z, noise)
 
-    def stay(z, noise, key, size, reached):
+    def add_difference(z, noise, key, size, reached, beside):
+        one, other = jax.random.randint(key, (2, 1), 1, jnp.maximum(beside, 2), jnp.int32)
+        moved = z + size * (z[(lane + one) % beside] - z[(lane + other) % beside])
+        before, after = (jnp.sum(a**2, axis=1, keepdims=True) for a in (z, moved))
+        return jnp.where(after > 0, jnp.sqrt(before / after), 1) * moved
+
+    def stay(z, noise, key, size, reached, beside):
         return z
 
-    by_kind = change_all, change_window, change_after, stay  # SMALL, WINDOW, AFTER, STAY
+    # SMALL, WINDOW, AFTER, DIFFERENCE, STAY
+    by_kind = change_all, change_window, change_after, add_difference, stay
 
     def block(i, carry, key, kind, size):
         particles, accepted, invalid = carry
         old = jax.tree.map(lambda a: lax.dynamic_slice_in_dim(a, i * lanes, lanes), particles)
-        for_noise, for_window = jax.random.split(jax.random.fold_in(key, i))
-        noise = width * fine_draws.normal(for_noise, old.z.shape, old.z.dtype)
-        about = old.z, noise, for_window, size.astype(old.z.dtype), old.reached
+        for_noise, for_choice = jax.random.split(jax.random.fold_in(key, i))
+        noise = lax.cond(
+            kind < DIFFERENCE,
+            lambda: width * fine_draws.normal(for_noise, old.z.shape, old.z.dtype),
+            lambda: jnp.zeros_like(old.z),
+        )
+        beside = jnp.clip(live - i * lanes, 1, lanes)  # points that live in this block
+        about = old.z, noise, for_choice, size.astype(old.z.dtype), old.reached, beside
         z = lax.switch(kind, by_kind, *about)
         o, reached = play(z)
         score = o.score.astype(old.score.dtype)
