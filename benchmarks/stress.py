@@ -110,7 +110,7 @@ def cma_es(key, sim, budget):
 
 def windows(key, sim, budget):
     """`stress` where failures that are cooled together move as those do that go on alone."""
-    as_alone = replace(SETTINGS, kinds_cooling_together=SETTINGS.kinds_by_width)
+    as_alone = replace(SETTINGS, kinds_cooling_together=(SETTINGS.kinds_by_width,))
     with mock.patch.object(descents, "SETTINGS", as_alone):
         return stress(key, sim, budget)
 
@@ -122,7 +122,7 @@ def slow_cooling(key, sim, budget):
     if (sample := found.proposal) is None:
         return None, found.episodes, None
     rows = resample(sample.log_weight, SETTINGS.cooled_failures, 0.5)
-    slowly = int(10 * portfolio.COOLING_SHARE * budget)
+    slowly = 10 * min(int(portfolio.COOLING_SHARE * budget), portfolio.MAX_COOLING)
     points, spent = cool_failures(for_cooling, sim, sample.points[rows], slowly, True)
     found_failures = explorers.failures_at(sim, points)
     few = portfolio.REFINE_EVALUATIONS

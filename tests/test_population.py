@@ -255,7 +255,7 @@ def test_differences_cool_a_thin_layer_further_than_windows_do(key, monkeypatch)
         return 0.5 * (points**2).sum(axis=1).min() - 12.5
 
     by_differences = excess()
-    windows = replace(ways.SETTINGS, kinds_cooling_together=ways.SETTINGS.kinds_by_width)
+    windows = replace(ways.SETTINGS, kinds_cooling_together=(ways.SETTINGS.kinds_by_width,))
     monkeypatch.setattr(ways, "SETTINGS", windows)
     assert 0 < 2 * by_differences < excess()
 

@@ -23,7 +23,7 @@ from jast._src.estimate.population.population import by_populations
 from jast._src.estimate.proposal_search.mixture_draws import resample
 from jast._src.estimate.redraw import redraw
 from jast._src.normal_space import transform
-from jast._src.runtime.device import where_few_points_run
+from jast._src.runtime.device import on_cpu, where_few_points_run
 from jast._src.runtime.host_errors import failing_runs, runs_made, runs_on_host
 from jast._src.search.refine.modes import Mode, Modes, modes, owners, spread
 from jast._src.search.refine.refine import refine
@@ -62,7 +62,8 @@ nothing else: its evaluations are the estimate's."""
 NOMINAL = 4096  # plain draws where populations follow, which begin with some themselves
 COOLING_SHARE = 0.2  # of the evaluations, to cool failures of the populations to the likeliest
 MAX_COOLING = 2**19
-"""Of them at most, as of those that cool slowly: one to two CPU seconds."""
+"""Evaluations that cooling takes at most, and slow cooling as many again: two million that cooled
+slowly made a call of the landing 5 CPU seconds slower, and its likeliest failure no likelier."""
 INDEPENDENT_SHARE = 0.25
 """Share of these by which no point replaces another, so that no mode is lost. With all of them the
 likeliest failure of the crossing is .35 nats less likely, of the cart-pole 6, of the ship 4; with
@@ -70,7 +71,7 @@ none they are as likely as with a quarter, or up to 2 nats likelier."""
 REFINE_EVALUATIONS = 100_000
 """Evaluations for pulling what was cooled to where log p is greatest, at most an eighth of all.
 With half as many the likeliest failure of the ship is .14 nats less likely and of the packets .24,
-with twice as many .1 and .04 likelier. Where nothing is gained any longer it ends by itself."""
+with twice as many .1 and .04 likelier. It ends by itself where no failure is left that gains."""
 POOL_FACTOR = 32  # failures in the pool for each that is returned: modes are told apart among these
 HOSTED_EXTRA = 14
 """Runs of a black box that no other piece of the work counts: of `check` 10, and those for objects,
@@ -171,7 +172,8 @@ class StressTest:
     def run_populations(self):
         """The probability by populations."""
         cooling, refining = self.cooling_and_refining()
-        rest = self.budget - self.spent - cooling - refining - 2 * (refining // 8)
+        after = refining + 2 * (refining // 8) + shares_cost(min(self.budget, DEFAULT_BUDGET))
+        rest = self.budget - self.spent - cooling - after
         rest = max(rest, MIN_POPULATION_BUDGET // 2)
         self.watch.doing("estimating")
         p = by_populations("stress", self.next_key(), self.sim, rest, placement=self.placement)
@@ -315,7 +317,7 @@ class StressTest:
         """
         if self.cooled is not None:
             left = self.budget - self.spent - self.parts.refine - self.modes_budget
-            if left < self.parts.slow_search:  # no more than the first coolings had
+            if left < self.parts.slow_search or not on_cpu():  # less than the first coolings had
                 return start
             found = self.cool("cooled slowly", self.cooled, min(left, MAX_COOLING), True)
             # all of them would take what is left to refine the likeliest

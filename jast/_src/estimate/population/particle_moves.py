@@ -9,9 +9,10 @@ that came after: every draw stays below it, as in splitting (Cerou and Guyader 2
 nothing comes after, and the other draws a few neighbouring numbers anew, which is a Gibbs move of
 a random window; in long episodes it mixes where small changes of everything do not. At small widths
 failures are a thin layer at right angles to their own direction, and a small change is as small as
-the layer is thin: there the other move goes along the difference of two other points (differential
-evolution: ter Braak 2006), and stays as far from the origin.
-`python -m benchmarks.populations` measures them all.
+the layer is thin: there the other move goes along the difference of two other points, as in
+differential evolution (ter Braak 2006), and then back to as far from the origin as it began.
+`python -m benchmarks.populations` measures the first three, `python -m benchmarks.stress --methods
+stress windows` the last.
 """
 
 from functools import partial
@@ -155,8 +156,9 @@ def move_particles(
     ``before``: the width that the points were drawn with, where it was another one. Numbers that an
     episode did not use are scaled to the new one, as nothing ties them. ``wide`` [D], bool: the
     numbers that have this width; the others have that of the model. Default: all. ``kinds``: of
-    the moves, which alternate; differences keep N(0, width^2 I) but nearly, as they tie points that
-    move side by side to one another.
+    the moves, which alternate. Differences serve where all numbers have the width, and keep
+    N(0, width^2 I) but nearly: points that move side by side are tied to one another, and the way
+    back is scaled otherwise.
     """
     dtype, live = np.dtype(particles.z.dtype), len(rows)
     places = np.arange(len(particles.z), dtype=np.int32)
